@@ -129,6 +129,13 @@ class GraphLinearizer:
         border = np.column_stack([np.diag(1.0 / sigma), -states.constants / sigma])
         return (yield from chain.solve_steps(border))
 
+    @property
+    def has_freed_beam(self) -> NDArray[np.bool_]:
+        """Which of the beam speeds (M,) something was freed on."""
+        if self._freed is None:
+            return np.zeros(len(self.problem.beams.speed), np.bool_)
+        return np.asarray(self._freed.beams.any(axis=1))
+
     def inertial_rows(self, states: States) -> Array:
         """Return the rows of inertial data and walks, see :class:`InertialRows`."""
         rows = self._inertial.rows(self.intervals, states)

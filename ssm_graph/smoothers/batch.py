@@ -239,7 +239,7 @@ class SsmSmoother:
             changed = None
             if number + 1 < self.config.max_iterations:
                 changed = yield from faults.look_steps(
-                    linearizer, states, this.step, update_sigmas=this.update_sigmas
+                    linearizer, states, update_sigmas=this.update_sigmas
                 )
             if changed is not None:
                 linearizer, states = changed.linearizer, changed.states
@@ -270,7 +270,9 @@ class SsmSmoother:
         problem, aids, known = linearizer.problem, linearizer.weighted, np.ones(len(used.aids))
         t, weights, keyframe_s = last.mahalanobis_sq, last.weights, problem.keyframe_s
         beams_s = keyframe_s[problem.beams.keyframe]
-        says, *found = informative(DVL, t, weights, beams_s, used.of_beams.kernel)
+        says, *found = informative(
+            DVL, t, weights, beams_s, used.of_beams.kernel, freed=linearizer.has_freed_beam
+        )
         beams = says / faults.inflation_of(DVL)
         for aid in aids.all:
             own = aids.of(aid, last.aid_mahalanobis_sq), aids.of(aid, last.aid_weights)

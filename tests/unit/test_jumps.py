@@ -7,7 +7,7 @@ import pytest
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import GYRO_BIAS
-from ssm_graph.live.estimator.jumps import AXES, JUMP, SPACING_S, TIMES, Jumps
+from ssm_graph.live.estimator.jumps import AXES, JUMP, SIZE, SPACING_S, TIMES, Jumps
 
 N, M, STEPS, AXIS = 15, 4, 12, 2
 
@@ -67,6 +67,16 @@ def test_excluded_jumps_add_nothing_and_certain_ones_what_they_moved() -> None:
     at = GYRO_BIAS.start + AXIS
     assert found[at, at] == pytest.approx(JUMP**2, rel=0.1)
     assert found[at - 1, at - 1] < 1e-3 * JUMP**2
+
+
+def test_chance_adds_nothing_where_the_data_say_much() -> None:
+    """Two sigmas of a size that is known to a hundredth; weakly seen they may be one."""
+    jumps, information = Jumps.none(N).with_next(0.0), np.zeros(AXES * TIMES)
+    for seen, is_added in ((1e4, False), (10.0, True)):
+        information[AXIS] = seen / SIZE**2
+        noise = jumps._replace(information=information, score=3.0 * np.sqrt(information))
+        adds = noise._replace(score=noise.score * (1.0 if is_added else 2.0 / 3.0)).unexcluded(N)
+        assert (np.trace(adds) > 0.0) == is_added
 
 
 def test_times_are_spaced_and_the_oldest_makes_room() -> None:

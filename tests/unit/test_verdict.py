@@ -19,8 +19,8 @@ from ssm_graph.mission.answer import SUSPECT_STRETCH_S
 from ssm_graph.mission.estimate import Status
 from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.simulation import DiveRoute, GnssSettings, Grade, SimulatedMission, TransitRoute
-from ssm_graph.smoothers.faults.windows import most_by_noise
-from ssm_graph.smoothers.verdict import contradictions, efficiency
+from ssm_graph.smoothers.faults.windows import informative, most_by_noise
+from ssm_graph.smoothers.verdict import LEAST_EFFICIENCY, contradictions, efficiency
 from tests.helpers import outcome, simulated, true_states, with_imu, with_initial
 
 
@@ -66,6 +66,20 @@ def test_readings_far_noisier_than_stated_say_no_more_than_their_variance() -> N
     assert np.isinf(most[~is_noisy]).all()
     assert np.mean((most * weights)[is_noisy]) == pytest.approx(1.0 / 16.0, rel=0.1)
     assert np.isinf(most_by_noise(t[1000:1010], weights[1000:1010], np.arange(10.0))).all()
+
+
+@pytest.mark.parametrize("is_freed", [False, True])
+def test_noise_that_a_lie_leaves_is_not_said(*, is_freed: bool) -> None:
+    """Eight sigmas on two beams of four are all beams' noise, or none where they were freed."""
+    rng, kernel = np.random.default_rng(1), LogKernel()
+    time_s, beam = np.repeat(np.arange(400.0), 4), np.tile(np.arange(4), 400)
+    is_off = (beam % 2 == 0) & (time_s >= 200.0)
+    t = np.where(is_off, 8.0 * np.sin(time_s), rng.standard_normal(1600)) ** 2
+    weights, freed = kernel.weight(t), is_off & is_freed
+    says, found = informative("DVL", t, weights, time_s, kernel, freed=freed)
+    assert (found is None) == is_freed
+    assert (np.mean((says * weights)[is_off]) < 0.05) == is_freed
+    assert np.min(says[time_s < 200.0]) >= LEAST_EFFICIENCY
 
 
 @pytest.mark.parametrize("n", [30, 60, 150])

@@ -8,9 +8,9 @@ import pytest
 from ssm_graph.base.frozen import Array
 from ssm_graph.graph.inertial_rows import InertialFit
 from ssm_graph.mission.estimate import Status
-from ssm_graph.mission.fault import DetectedFault
+from ssm_graph.mission.fault import DetectedFault, Treatment
 from ssm_graph.mission.problem import build_problem
-from ssm_graph.simulation import DvlSettings, Fault, FaultShape, with_faults
+from ssm_graph.simulation import DvlSettings, Fault, FaultShape, Grade, with_faults
 from ssm_graph.simulation.faults import Sensor
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
 from ssm_graph.smoothers.faults.search import FaultSearch
@@ -71,3 +71,22 @@ def test_inertial_noise_of_a_mission(factor: float, status: Status) -> None:
     assert estimate.status is status, estimate.reason
     assert any(one.sensor == "IMU" for one in estimate.faults) == (factor > 1.0)
     assert ("IMU" in estimate.reason) == (factor > 1.0)
+
+
+@pytest.mark.slow
+def test_a_loose_answer_is_no_noise() -> None:
+    """Metres off without fixes, where rows of other states than the solved ones say anything."""
+    sim = simulated(
+        duration_s=300.0,
+        grade=Grade.MEMS,
+        dvl=DvlSettings(noise=0.005),
+        gnss=None,
+        realistic=True,
+        calibrates=True,
+        seed=1,
+    )
+    found = SsmSmoother(SmootherConfig(fault_search=FaultSearch())).solve(
+        build_problem(sim.mission)
+    )
+    of_imu = [one.treatment for one in found.faults if one.sensor == "IMU"]
+    assert of_imu == [Treatment.WIDENED]

@@ -156,20 +156,18 @@ class Linear:
         """With nothing freed."""
         return self.bare.problem
 
+    def inertial_rows(self, off: Array | float = 0.0) -> Array:
+        """Return the rows (K - 1, n, 2 n + c + 1) of :attr:`solution`, which miss less by that."""
+        missed = (self.between.missed - off)[:, :, None]
+        return np.concatenate([self.between.jacobian, self.constants.between, missed], axis=2)
+
     def solved_steps(self, own: Array, between: Array) -> Steps[Array]:
         """Return the step (K, n) of the trajectory alone for errors (R,) and (K - 1, m) of rows."""
         solution = yield from self.bare.solve_rows_steps(
             self.states,
             self.own.keyframe,
             np.column_stack([self.own.jacobian, self.constants.own, self.own.missed - own]),
-            np.concatenate(
-                [
-                    self.between.jacobian,
-                    self.constants.between,
-                    (self.between.missed - between)[:, :, None],
-                ],
-                axis=2,
-            ),
+            self.inertial_rows(between),
         )
         return solution.step - solution.sensitivity @ solution.constants_step
 

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from factors.similarity import WEIGHT_FLOOR
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps
-from ssm_graph.engine.chain import ChainSolution
 from ssm_graph.engine.extras import Extras
 from ssm_graph.engine.reweighting import NEAR_SIGMAS
 from ssm_graph.engine.states import States
@@ -88,17 +87,12 @@ class FaultWatch:
         return np.where(self.aids_out, WEIGHT_FLOOR, weights)
 
     def look_steps(
-        self,
-        linearizer: GraphLinearizer,
-        states: States,
-        step: ChainSolution,
-        *,
-        update_sigmas: float,
+        self, linearizer: GraphLinearizer, states: States, *, update_sigmas: float
     ) -> Steps[Changed | None]:
         """Search once the solution is near; return what has changed, None for nothing.
 
         What is found is freed; then it is searched again at what the solution has become, until
-        nothing changes any more. ``linearizer`` and ``step`` are those of the pass.
+        nothing changes any more. ``linearizer`` is that of the pass.
         """
         if self._is_done or self._bare is None or self._search is None:
             return None
@@ -122,7 +116,7 @@ class FaultWatch:
             self._unstated = self._search.unstated(judge, channels, self._sized(states))
             if self._unstated is not None:
                 is_same = False
-                fit = inertial_fit(linearizer.inertial_rows(states), step)
+                fit = inertial_fit(linear.inertial_rows(), linear.solution)
                 self._contradicted = noisier_than_stated(fit, self._problem.keyframe_s)
                 chain = self._unstated.widened(self._problem.chain)
                 self._problem = replace(self._problem, chain=chain)

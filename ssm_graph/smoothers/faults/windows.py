@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import bdtrc
 
 from factors.similarity import WEIGHT_FLOOR, Kernel
@@ -189,9 +190,19 @@ def disagreeing(readings: Iterable[Readings], keyframe_s: Array) -> list[Detecte
 
 
 def informative(
-    sensor: str, t: Array, weights: Array, time_s: Array, kernel: Kernel, *, dim: int = 1
+    sensor: str,
+    t: Array,
+    weights: Array,
+    time_s: Array,
+    kernel: Kernel,
+    *,
+    dim: int = 1,
+    freed: NDArray[np.bool_] | None = None,
 ) -> tuple[Array, DetectedFault | None]:
     """Return how much each measurement says (M,), by its weight, and whether a sensor is noisy.
+
+    What a lie leaves says nothing of the noise, and is judged apart: it counts for less, but larger
+    sigmas would not mend it.
 
     Parameters
     ----------
@@ -199,10 +210,14 @@ def informative(
     t, weights, time_s : (M,) squared Mahalanobis lengths, what the kernel made of these, s.
     kernel : that of the weights.
     dim : of the measurements.
+    freed : (M,) those that a lie was taken off; if off all of them, all count alike.
     """
-    most = most_by_noise(t, weights, time_s, dim=dim)
+    freed = np.zeros(len(t), np.bool_) if freed is None else freed & ~freed.all()
+    most = np.full(len(t), np.inf)
+    for own in (freed, ~freed):
+        most[own] = most_by_noise(t[own], weights[own], time_s[own], dim=dim)
     says = np.minimum(efficiency(t, weights, kernel, dim=dim), most)
-    return says, _noisy(sensor, t, most, time_s, dim=dim)
+    return says, _noisy(sensor, t, np.where(freed, np.inf, most), time_s, dim=dim)
 
 
 def _noisy(sensor: str, t: Array, most: Array, time_s: Array, *, dim: int) -> DetectedFault | None:
