@@ -133,9 +133,7 @@ def doubt_of(watch: Watch, sigma: Array, keyframe: Keyframe) -> Doubt | None:
 
 
 def _doubt_of_height(watch: Watch, time_s: float) -> Doubt | None:
-    """Say why the height cannot be gone on from: depth or fixes contradict it, and nothing else
-    that measures it agrees.
-    """
+    """Say why the height cannot be gone on from: what contradicts it, while nothing agrees."""
     is_out = watch.heights_refused >= LOCKED_OUT_FIXES
     if is_out and time_s - watch.last_depth_s > VOUCHED_S:
         reason = f"{watch.heights_refused} GNSS fixes in a row contradict the height"
