@@ -152,7 +152,7 @@ class Feed:
         for kind, other in refused.items():
             text = f"{kind} from {place.name} refused: they come from {other.name}, which was heard"
             text += " first; a vehicle has one of each instrument"
-            self.tell("second_source", text, Severity.WARNING, burst=BURST)
+            self.tell("second_source", text, Severity.WARNING)
         return heard
 
     def _in_run_time(self, messages: list[Message], now: Now) -> list[Message]:

@@ -340,10 +340,11 @@ class UdpInput(Input):
             except OSError as error:  # an ICMP message about something else
                 self.feed.tell("receive_failed", error.strerror or str(error), Severity.WARNING)
                 break
-            if self._is_too_much(str(sender), len(datagram), now):
+            name = f"{sender[0]}:{sender[1]}"
+            if self._is_too_much(name, len(datagram), now):
                 continue
             whole = datagram if datagram.endswith(b"\n") else datagram + b"\n"
-            data.setdefault(str(sender), bytearray()).extend(whole)
+            data.setdefault(name, bytearray()).extend(whole)
             n_bytes += len(whole)
             if n_bytes >= CHUNK:
                 break

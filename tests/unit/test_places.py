@@ -1,0 +1,154 @@
+"""One instrument, several that claim to be it: who is heard, and when another one is."""
+
+from __future__ import annotations
+
+import socket
+from contextlib import ExitStack
+
+from ssm_graph.live.protocols.json_messages import JsonDecoder, encode_message
+from ssm_graph.live.sockets.endpoints import LOOPBACK, Endpoint, Transport
+from ssm_graph.live.sockets.inputs import MAX_SENDERS, TcpServerInput, UdpInput
+from ssm_graph.live.sockets.places import MOST_PLACES, SILENT_S, Place, Places
+from ssm_graph.live.sockets.sockets import InputConfig, SocketHub
+from ssm_graph.sensors.depth import DepthReading
+from ssm_graph.sensors.gnss import Fix
+from tests.instrument_fixture import Receiver, UdpSender
+
+WALL_S = 1_700_000_000.0
+
+
+class Turns:
+    """Places that speak of the depth, at times that a test sets."""
+
+    def __init__(self) -> None:
+        self.places, self.now_s = Places(), 0.0
+
+    def hears(self, place: Place, after_s: float = 0.1) -> bool:
+        """Return whether a place is heard, so long after the last one that spoke."""
+        self.now_s += after_s
+        return self.places.refused_for(place, DepthReading, self.now_s) is None
+
+
+def test_the_first_that_is_heard_counts() -> None:
+    """Whoever else speaks, however much; of another instrument he may be the first."""
+    turns, own, other = Turns(), Place("own"), Place("other")
+    assert turns.hears(own)
+    assert turns.hears(own)
+    assert not any(turns.hears(other, 0.001) for _ in range(90))
+    assert turns.hears(own)
+    assert turns.places.refused_for(other, Fix, turns.now_s) is None
+    assert turns.places.is_heard(own, DepthReading)
+    assert not turns.places.is_heard(other, DepthReading)
+
+
+def test_another_one_is_heard_where_the_first_is_silent_until_it_is_back() -> None:
+    """After a second and three intervals, which the other one has to have waited."""
+    turns, own, other = Turns(), Place("own"), Place("other")
+    assert all(turns.hears(own, 0.5) for _ in range(4))
+    assert not turns.hears(other, 60.0)  # nobody had looked: the first may have spoken as well
+    assert not turns.hears(other, 1.4)
+    assert turns.hears(other, 0.2)
+    assert turns.places.is_heard(other, DepthReading)
+    assert turns.hears(own)
+    assert not turns.hears(other)
+
+
+def test_a_client_that_calls_again_is_the_same() -> None:
+    """From its host; one that came in between does not take its turn."""
+    turns = Turns()
+    own, other = Place("own", "10.0.0.1"), Place("other", "10.0.0.2")
+    assert turns.hears(own)
+    assert turns.hears(own)
+    assert not turns.hears(other)
+    own.is_left = True
+    assert not turns.hears(other)
+    again = Place("own again", "10.0.0.1")
+    assert turns.hears(again)
+    assert not turns.hears(other, 0.9 * SILENT_S)
+    again.is_left = True
+    assert turns.hears(other, 1.1 * SILENT_S)
+
+
+def test_a_socket_for_every_datagram_keeps_nobody_out() -> None:
+    """Each of them speaks once; so many are remembered and no more."""
+    turns = Turns()
+    assert all(turns.hears(Place(str(k)), 0.1) for k in range(3 * MOST_PLACES))
+    assert len(turns.places._voices[DepthReading]) == MOST_PLACES
+
+
+class Steady:
+    """A clock that a test sets."""
+
+    now_s = 100.0
+
+    def __call__(self) -> float:
+        """Return seconds since some moment."""
+        return self.now_s
+
+
+def depth(clock: Steady, metres: float) -> bytes:
+    """Return a depth of now."""
+    return encode_message(DepthReading(WALL_S + clock.now_s, metres))
+
+
+def depths(receiver: Receiver) -> list[float]:
+    """Return the depths that came."""
+    return [message.depth for message in receiver.messages if isinstance(message, DepthReading)]
+
+
+def test_a_stranger_at_another_port_feeds_no_depths() -> None:
+    """Nor at the same one; what is refused is counted and told, with both places."""
+    clock = Steady()
+    kinds = (Transport.UDP, Transport.TCP_SERVER)
+    inputs = [InputConfig(kind.value, Endpoint(kind, LOOPBACK, 0), JsonDecoder) for kind in kinds]
+    wall_s = lambda: WALL_S + clock.now_s  # noqa: E731
+    with SocketHub(inputs, steady_s=clock, wall_s=wall_s) as hub, ExitStack() as stack:
+        receiver = Receiver(hub)
+        receiver.poll()
+        udp, tcp = hub.inputs
+        assert isinstance(udp, UdpInput)
+        assert isinstance(tcp, TcpServerInput)
+        own, stray = UdpSender(udp.port), UdpSender(udp.port)
+        stranger = stack.enter_context(socket.create_connection((LOOPBACK, tcp.port)))
+        for k in range(20):
+            clock.now_s += 0.1
+            own.send(depth(clock, 5.0))
+            receiver.until(lambda n=k: len(depths(receiver)) == n + 1)  # type: ignore[misc]
+            if k:
+                stray.send(depth(clock, 20.0))
+                stranger.sendall(50 * depth(clock, 20.0))
+            refused = [k, 50 * k]
+            receiver.until(lambda n=refused: [s.n_refused for s in hub.source_status()] == n)  # type: ignore[misc]
+        assert set(depths(receiver)) == {5.0}
+        said = [event.text for event in receiver.events if event.kind == "second_source"]
+        assert len(said) == 2
+        assert all("depth messages from" in text and "was heard first" in text for text in said)
+        for k in range(12):
+            clock.now_s += 0.1
+            stranger.sendall(depth(clock, 20.0))
+            receiver.until(lambda n=k: hub.source_status()[1].n_bytes > 950 * 50 + n)  # type: ignore[misc]
+        receiver.until(lambda: depths(receiver)[-1] == 20.0)
+        own.close()
+        stray.close()
+
+
+def test_datagrams_of_many_senders_are_told_apart_up_to_a_number() -> None:
+    """Halves of two senders do not meet, and the first of them stays."""
+    clock = Steady()
+    config = InputConfig("any", Endpoint(Transport.UDP, LOOPBACK, 0), JsonDecoder)
+    with SocketHub([config], steady_s=clock, wall_s=lambda: WALL_S + clock.now_s) as hub:
+        receiver = Receiver(hub)
+        receiver.poll()
+        (source,) = hub.inputs
+        assert isinstance(source, UdpInput)
+        own = UdpSender(source.port)
+        for k in range(MAX_SENDERS + 20):
+            clock.now_s += 0.01
+            own.send(depth(clock, 5.0))
+            receiver.until(lambda n=k: len(depths(receiver)) == n + 1)  # type: ignore[misc]
+            other = UdpSender(source.port)
+            other.send(b"{")
+            other.close()
+        receiver.until(lambda: hub.source_status()[0].n_refused >= MAX_SENDERS)
+        assert len(source._senders) <= MAX_SENDERS
+        own.close()
