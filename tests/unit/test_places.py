@@ -60,12 +60,12 @@ def test_a_client_that_calls_again_is_the_same() -> None:
     assert turns.hears(own)
     assert turns.hears(own)
     assert not turns.hears(other)
-    own.is_left = True
+    own.leave()
     assert not turns.hears(other)
     again = Place("own again", "10.0.0.1")
     assert turns.hears(again)
     assert not turns.hears(other, 0.9 * SILENT_S)
-    again.is_left = True
+    again.leave()
     assert turns.hears(other, 1.1 * SILENT_S)
 
 

@@ -300,7 +300,7 @@ class TcpServerInput(Input):
 
     def _lose(self, sock: socket.socket, now: Now, why: str) -> list[Message]:
         self.feed.tell("connection_lost", f"a client is gone: {why}", Severity.WARNING)
-        self._reading[sock].place.is_left = True
+        self._reading[sock].place.leave()
         return self._end(sock, now)
 
 
@@ -367,7 +367,7 @@ class UdpInput(Input):
         if sender not in self._senders:
             if len(self._senders) >= MAX_SENDERS:
                 _, last = self._senders.popitem()
-                last.place.is_left = True
+                last.place.leave()
             channel = self._senders[sender] = self.feed.channel(now, f"sender {sender}", sender)
             channel.heard_s = -math.inf
             channel.is_stale = self._all.is_stale

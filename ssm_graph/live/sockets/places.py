@@ -34,6 +34,10 @@ class Place:
     is_left: bool = False
     """Whether the connection is gone."""
 
+    def leave(self) -> None:
+        """Nothing more comes from here."""
+        self.is_left = True
+
 
 @dataclass(slots=True)
 class _Voice:
@@ -60,6 +64,16 @@ class _Voice:
                 self.interval_s = max(since_s, 0.9 * self.interval_s)
             self.n_heard += 1
         self.heard_s = steady_s
+
+    def move_to(self, place: Place) -> None:
+        """Speak from there: the same client has called again."""
+        self.place = place
+
+    def waited_s(self, other: _Voice, steady_s: float) -> float:
+        """Return for how long it has waited in vain since the other one was heard, s."""
+        if self.waits_s < other.heard_s:
+            self.waits_s = steady_s
+        return steady_s - self.waits_s
 
 
 class Places:
@@ -94,7 +108,7 @@ class Places:
         if at == len(voices):
             at = next((k for k, voice in enumerate(voices) if _follows(place, voice.place)), at)
             if at < len(voices):
-                voices[at].place = place
+                voices[at].move_to(place)
             else:
                 at = min(at, MOST_PLACES - 1)
                 voices[at:] = [_Voice(place)]
@@ -110,9 +124,7 @@ class Places:
         """
         if before.place.is_left:
             return steady_s - before.heard_s >= before.patience_s
-        if voice.waits_s < before.heard_s:
-            voice.waits_s = steady_s
-        return steady_s - voice.waits_s >= before.patience_s
+        return voice.waited_s(before, steady_s) >= before.patience_s
 
 
 def _follows(place: Place, other: Place) -> bool:
