@@ -72,6 +72,11 @@ class Channel:
         self.heard_s += span_s
         self.is_stale = True
 
+    def stand_for(self, channel: Channel) -> None:
+        """Take note of what has come by one of those that this one stands for."""
+        self.heard_s = max(self.heard_s, channel.heard_s)
+        self.fed_s = max(self.fed_s, channel.fed_s)
+
     def catch_up(self) -> None:
         """All that waited has been read."""
         self.is_stale = False

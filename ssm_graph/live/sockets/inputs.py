@@ -352,8 +352,7 @@ class UdpInput(Input):
         for name, own in data.items():
             channel = self._channel_of(name, now)
             messages += self.feed.take(channel, bytes(own), now)
-            self._all.heard_s = max(self._all.heard_s, channel.heard_s)
-        self._all.fed_s = now.steady_s
+            self._all.stand_for(channel)
         self._is_silent = self._is_silent and self.feed.is_silent(self._all, now)
         if is_all:
             for channel in self._channels:
