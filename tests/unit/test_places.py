@@ -15,6 +15,7 @@ from ssm_graph.sensors.gnss import Fix
 from tests.instrument_fixture import Receiver, UdpSender
 
 WALL_S = 1_700_000_000.0
+FIX = Fix(1.0, 0.0, 0.0, 0.0, (1.0, 1.0, 1.0))
 
 
 class Turns:
@@ -25,8 +26,12 @@ class Turns:
 
     def hears(self, place: Place, after_s: float = 0.1) -> bool:
         """Return whether a place is heard, so long after the last one that spoke."""
+        return bool(self.passed(place, after_s))
+
+    def passed(self, place: Place, after_s: float = 0.1) -> int:
+        """Return how many messages of a place pass."""
         self.now_s += after_s
-        return self.places.refused_for(place, DepthReading, self.now_s) is None
+        return len(self.places.hear(place, DepthReading(self.now_s, 1.0), self.now_s).passed)
 
 
 def test_the_first_that_is_heard_counts() -> None:
@@ -36,7 +41,7 @@ def test_the_first_that_is_heard_counts() -> None:
     assert turns.hears(own)
     assert not any(turns.hears(other, 0.001) for _ in range(90))
     assert turns.hears(own)
-    assert turns.places.refused_for(other, Fix, turns.now_s) is None
+    assert turns.places.hear(other, FIX, turns.now_s).passed == [FIX]
     assert turns.places.is_heard(own, DepthReading)
     assert not turns.places.is_heard(other, DepthReading)
 
@@ -67,6 +72,39 @@ def test_a_client_that_calls_again_is_the_same() -> None:
     assert not turns.hears(other, 0.9 * SILENT_S)
     again.leave()
     assert turns.hears(other, 1.1 * SILENT_S)
+
+
+def test_a_client_that_has_called_again_waits_for_the_end_of_its_last_call() -> None:
+    """What it sent before is read together with what it sends now, and nothing of it is lost."""
+    turns = Turns()
+    own, again = Place("own", "10.0.0.1"), Place("own again", "10.0.0.1")
+    assert turns.hears(own)
+    for _ in range(8):
+        assert turns.hears(own, 0.05)
+        assert not turns.hears(again, 0.05)
+    assert len(turns.places.waiting(again)) == 8
+    own.leave()
+    assert turns.passed(again) == 9
+    assert not turns.places.waiting(again)
+
+
+def test_who_spoke_beside_another_one_for_long_does_not_take_its_place() -> None:
+    """It leaves, and calls again: its turn is kept for a second, and what waited is refused."""
+    turns = Turns()
+    own, other = Place("own", "10.0.0.1"), Place("other", "10.0.0.1")
+    assert turns.hears(own)
+    refused = 0
+    for _ in range(15):
+        assert turns.hears(own, 0.05)
+        turns.now_s += 0.05
+        heard = turns.places.hear(other, DepthReading(turns.now_s, 2.0), turns.now_s)
+        assert not heard.passed
+        refused += heard.n_refused
+    assert refused == 15
+    assert heard.instead is own
+    own.leave()
+    assert not turns.hears(other)
+    assert turns.hears(Place("own again", "10.0.0.1"))
 
 
 def test_a_socket_for_every_datagram_keeps_nobody_out() -> None:

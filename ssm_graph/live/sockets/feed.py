@@ -112,7 +112,8 @@ class Feed:
     def channel(self, now: Now, caller: str = "", host: str = "") -> Channel:
         """Return the begin of a connection; of one that others begin, with whom and from where."""
         where = caller or self.address
-        return Channel(self._make_decoder(), now, Place(f"{self.name}, {where}", host))
+        place = Place(f"{self.name}, {where}", host and f"{self.name} {host}")
+        return Channel(self._make_decoder(), now, place)
 
     def take(self, channel: Channel, data: bytes, now: Now) -> list[Message]:
         """Return the messages that these bytes complete and that are not too many."""
@@ -145,20 +146,19 @@ class Feed:
 
     def _of_one_place(self, place: Place, messages: list[Message], now: Now) -> list[Message]:
         """Return messages without those of instruments that are heard from elsewhere, told."""
-        heard = []
+        passed = []
         refused: dict[str, Place] = {}
         for message in messages:
-            other = self._places.refused_for(place, type(message), now.steady_s)
-            if other is None:
-                heard.append(message)
-            else:
-                refused[called(message)] = other
-        self._n_refused += len(messages) - len(heard)
+            heard = self._places.hear(place, message, now.steady_s)
+            passed += heard.passed
+            self._n_refused += heard.n_refused
+            if heard.instead is not None:
+                refused[called(message)] = heard.instead
         for kind, other in refused.items():
             text = f"{kind} from {place.name} refused: they come from {other.name}, which was heard"
             text += " first; a vehicle has one of each instrument"
             self.tell("second_source", text, Severity.WARNING)
-        return heard
+        return passed
 
     def _in_run_time(self, messages: list[Message], now: Now) -> list[Message]:
         """Return messages in the time of the run, without those of strange clocks, which is told.
@@ -204,8 +204,9 @@ class Feed:
 
     def held(self, channel: Channel, now: Now) -> list[Readings]:
         """Return complete messages that a decoder holds, as they would be read now."""
-        waiting = channel.decoder.waiting()
-        heard = [one for one in waiting if self._places.is_heard(channel.place, type(one))]
+        waiting, place = channel.decoder.waiting(), channel.place
+        heard = [one for one in waiting if self._places.is_heard(place, type(one))]
+        heard += self._places.waiting(place)
         return [self._clocks.of(self.name, one).readings(one, now) for one in heard]
 
     def end(self, channel: Channel, now: Now) -> list[Message]:

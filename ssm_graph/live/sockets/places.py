@@ -2,14 +2,15 @@
 
 A place is a connection, or a sender of datagrams. Of several that send messages of one kind the one
 that was heard first counts; the others are refused, which is told, and one of them is heard once
-the first has fallen silent. It gives way where the first is back.
+the first has fallen silent. It gives way where the first is back. What a new one of the same host
+sends waits at first: a client may have called again before what it sent by its last call is read.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
 
 from ssm_graph.sensors.messages import Message
 
@@ -19,6 +20,10 @@ SILENT_TIMES: Final = 3.0
 """And for so many of its usual intervals."""
 LONGEST_INTERVAL_S: Final = 1.5
 """No place is waited for longer than three of these."""
+WAITS_S: Final = 1.0
+"""So long messages of a new place wait to be those of the client that was heard so far."""
+MOST_WAITING: Final = 1000
+"""More are not of a client that has called again."""
 MOST_PLACES: Final = 16
 """Of one kind of message that are remembered; the newest gives way, for the first ones count."""
 
@@ -30,13 +35,26 @@ class Place:
     name: str
     """For people."""
     host: str = ""
-    """Of a client that called: another call from there takes its place."""
+    """Of a client that called, with the source: another call from there takes its place."""
     is_left: bool = False
     """Whether the connection is gone."""
 
     def leave(self) -> None:
         """Nothing more comes from here."""
         self.is_left = True
+
+    def is_of_host(self, other: Place) -> bool:
+        """Return whether another one may be the same client."""
+        return bool(self.host) and self.host == other.host
+
+
+class Heard(NamedTuple):
+    """What becomes of a message, and of those before it that waited."""
+
+    passed: list[Message]
+    n_refused: int = 0
+    instead: Place | None = None
+    """Where the instrument is heard, if any were refused"""
 
 
 @dataclass(slots=True)
@@ -49,28 +67,46 @@ class _Voice:
     n_heard: int = 0
     """Moments at which it was heard."""
     waits_s: float = -math.inf
-    """When it was first refused since the one before it was heard."""
+    """When it was first not heard since the one before it was."""
+    met_s: float = math.inf
+    """When it was first not heard at all."""
+    waiting: list[Message] = field(default_factory=list)
+    is_strange: bool = False
+    """Whether it spoke for long while another one was heard."""
 
     @property
     def patience_s(self) -> float:
         """How long it has to be silent before another one is heard."""
         return max(SILENT_S, SILENT_TIMES * self.interval_s)
 
-    def hear(self, steady_s: float) -> None:
-        """Take note that it speaks."""
+    def hear(self, message: Message, steady_s: float) -> list[Message]:
+        """Take note that it speaks; return all that it has to say."""
         if steady_s > self.heard_s:
             if self.n_heard:
                 since_s = min(steady_s - self.heard_s, LONGEST_INTERVAL_S)
                 self.interval_s = max(since_s, 0.9 * self.interval_s)
             self.n_heard += 1
-        self.heard_s = steady_s
+        self.heard_s, self.met_s, self.is_strange = steady_s, math.inf, False
+        waiting, self.waiting = self.waiting, []
+        return [*waiting, message]
 
-    def move_to(self, place: Place) -> None:
-        """Speak from there: the same client has called again."""
-        self.place = place
+    def wait(self, message: Message, steady_s: float, before: Place) -> int:
+        """Have a message wait while it may be of the same client; return how many are refused."""
+        self.met_s = min(self.met_s, steady_s)
+        is_long = steady_s - self.met_s > WAITS_S or len(self.waiting) >= MOST_WAITING
+        self.is_strange = self.is_strange or is_long or not before.is_of_host(self.place)
+        if not self.is_strange:
+            self.waiting.append(message)
+            return 0
+        n_refused, self.waiting = len(self.waiting) + 1, []
+        return n_refused
+
+    def follow(self, place: Place, waiting: list[Message]) -> None:
+        """Speak from another place: the same client has called again."""
+        self.place, self.waiting = place, waiting
 
     def waited_s(self, other: _Voice, steady_s: float) -> float:
-        """Return for how long it has waited in vain since the other one was heard, s."""
+        """Return for how long it has spoken in vain since the other one was heard, s."""
         if self.waits_s < other.heard_s:
             self.waits_s = steady_s
         return steady_s - self.waits_s
@@ -82,17 +118,22 @@ class Places:
     def __init__(self) -> None:
         self._voices: dict[type[Message], list[_Voice]] = {}
 
-    def refused_for(self, place: Place, kind: type[Message], steady_s: float) -> Place | None:
-        """Return the place that is heard instead; None where this one is, of which note is taken.
+    def hear(self, place: Place, message: Message, steady_s: float) -> Heard:
+        """Return what may pass now that a message has come from a place, and what is refused.
 
         A sender that spoke once only, as one does that opens a socket for every datagram, keeps
         nobody out.
         """
-        voice, before = self._voice(place, kind)
-        if before is not None and not self._is_silent(before, voice, steady_s):
-            return before.place
-        voice.hear(steady_s)
-        return None
+        voice, before = self._voice(place, type(message))
+        if before is None or self._is_silent(before, voice, steady_s):
+            return Heard(voice.hear(message, steady_s))
+        n_refused = voice.wait(message, steady_s, before.place)
+        return Heard([], n_refused, before.place if n_refused else None)
+
+    def waiting(self, place: Place) -> list[Message]:
+        """Return what waits of a place."""
+        voices = (voice for voices in self._voices.values() for voice in voices)
+        return [message for voice in voices if voice.place is place for message in voice.waiting]
 
     def is_heard(self, place: Place, kind: type[Message]) -> bool:
         """Return whether a message of this place would be heard now, as far as is known."""
@@ -106,12 +147,15 @@ class Places:
         voices = self._voices.setdefault(kind, [])
         at = next((k for k, voice in enumerate(voices) if voice.place is place), len(voices))
         if at == len(voices):
-            at = next((k for k, voice in enumerate(voices) if _follows(place, voice.place)), at)
-            if at < len(voices):
-                voices[at].move_to(place)
-            else:
-                at = min(at, MOST_PLACES - 1)
-                voices[at:] = [_Voice(place)]
+            at = min(at, MOST_PLACES - 1)
+            voices[at:] = [_Voice(place)]
+        if not voices[at].is_strange:
+            others = (voice.place for voice in voices[:at])
+            left = (k for k, one in enumerate(others) if one.is_left and one.is_of_host(place))
+            before = next(left, at)
+            if before < at:
+                voices[before].follow(place, voices.pop(at).waiting)
+                at = before
         known = (voice for voice in voices[:at] if voice.n_heard > 1)
         return voices[at], max(known, key=lambda voice: voice.heard_s, default=None)
 
@@ -125,8 +169,3 @@ class Places:
         if before.place.is_left:
             return steady_s - before.heard_s >= before.patience_s
         return voice.waited_s(before, steady_s) >= before.patience_s
-
-
-def _follows(place: Place, other: Place) -> bool:
-    """Return whether a place is that of the same client, which has called again."""
-    return bool(other.is_left and place.host and place.host == other.host)
