@@ -77,6 +77,13 @@ class _Measured(NamedTuple):
         columns: tuple[Any, ...] = tuple(np.concatenate(pair) for pair in pairs)
         return _Measured(self.aid.followed_by(other.aid), *columns)
 
+    def are_far(self, step: Array, root_cov: Array, sigmas: float) -> NDArray[np.bool_]:
+        """Return which (M,) are further than that from what the graph predicts of one keyframe."""
+        root, left = self.jacobian @ root_cov, -self.error - self.jacobian @ step
+        S = root @ np.swapaxes(root, 1, 2) + np.eye(self.aid.dim)
+        distance_sq = (left * np.linalg.solve(S, left[..., None])[..., 0]).sum(axis=1)
+        return np.asarray(distance_sq > sigmas**2 * self.aid.dim)
+
     def rows_of(self, begin: int, end: int) -> slice:
         """Return which belong to successive keyframes."""
         search = self.aid.keyframe.searchsorted
@@ -178,20 +185,31 @@ class WindowAids:
     def refuse_far(self, k: int, step: Array, root_cov: Array, *, sigmas: float) -> None:
         """Let no depth or fix of the newest keyframe count that is too far from its prediction.
 
-        As for the others, step (n,) and root (n, n) are what the graph predicts.
+        Of a fix that only its height puts there the height does not count, and the rest does. As
+        for the others, step (n,) and root (n, n) are what the graph predicts.
         """
         for name in (DepthMeans.name, Fixes.name):
             one = self._all.get(name)
             rows = np.s_[0:0] if one is None else one.rows_of(k, k + 1)
             if one is None or rows.start == rows.stop:
                 continue
-            H, error = one.jacobian[rows], one.error[rows]
-            root, left = H @ root_cov, -error - H @ step
-            S = root @ np.swapaxes(root, 1, 2) + np.eye(one.aid.dim)
-            distance_sq = (left * np.linalg.solve(S, left[..., None])[..., 0]).sum(axis=1)
-            is_out = one.is_out.copy()
-            is_out[rows] = distance_sq > sigmas**2 * one.aid.dim
-            self._all[name] = one._replace(is_out=is_out)
+            some = one.take(rows)
+            is_out = some.are_far(step, root_cov, sigmas)
+            if isinstance(some.aid, Fixes) and is_out.any():
+                level = self._level(some, is_out)
+                is_out = level.are_far(step, root_cov, sigmas)
+                some = self._level(some, some.are_far(step, root_cov, sigmas) & ~is_out)
+            self._all[name] = one.replaced(rows, some._replace(is_out=is_out))
+
+    def _level(self, fixes: _Measured, which: NDArray[np.bool_]) -> _Measured:
+        """Return fixes, some of them (M,) without what their height says."""
+        if not which.any():
+            return fixes
+        assert isinstance(fixes.aid, Fixes)
+        aid = fixes.aid.without_height(which, self._sensors.frame)
+        anew = aid.root_information @ np.linalg.cholesky(fixes.aid.covariance_n)
+        error = (anew @ fixes.error[..., None])[..., 0]
+        return fixes._replace(aid=aid, error=error, jacobian=anew @ fixes.jacobian)
 
     def meet_prediction(self, k: int, step: Array, root_cov: Array, kernel: Kernel) -> bool:
         """Weigh the measurements of the newest keyframe by what all before it predict, together.

@@ -23,6 +23,7 @@ from ssm_graph.mission.navigation import Health, Navigation
 from ssm_graph.mission.problem import ProblemConfig, build_problem
 from ssm_graph.mission.start.alignment import N_HYPOTHESES, align
 from ssm_graph.mission.vehicle import Vehicle
+from ssm_graph.sensors.depth import DepthReading
 from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.messages import Message
 from ssm_graph.simulation import (
@@ -180,6 +181,20 @@ def test_it_is_said_to_align_until_nothing_is_left_to_catch_up_with() -> None:
             assert newest.time_s == message.time_s
     assert behind > 3
     assert last_of(smoother).health is Health.GOOD
+
+
+def test_a_sensor_that_contradicts_the_rest_is_begun_without() -> None:
+    """Depths of elsewhere from the begin on: told, and the answer is where fixes put it."""
+    vehicle, messages = given(moving())
+    off = [replace(m, depth=m.depth + 20.0) if isinstance(m, DepthReading) else m for m in messages]
+    smoother = pushed(off, vehicle)
+    newest = last_of(smoother)
+    truth = moving().truth_at(np.array([newest.time_s]))
+    assert abs(newest.height - float(truth.height[0])) < 3.0
+    assert newest.health is Health.DEGRADED
+    said = [event.text for event in smoother.take_events() if event.kind == "aligned"]
+    assert len(said) == 1
+    assert "without depth, which contradicts the rest" in said[0]
 
 
 def calls(function: object, *args: object) -> int:

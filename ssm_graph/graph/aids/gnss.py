@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Final, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factors.gnss_position import fix_residual
 from ssm_graph.base.earth import LocalFrame
@@ -23,6 +24,8 @@ GNSS_LEVER_ARM: Final = "gnss_lever_arm"
 GNSS_TIME_OFFSET: Final = "gnss_time_offset"
 GNSS_DRIFT: Final = "gnss_drift"
 EAST_NORTH_UP: Final = ("east", "north", "up")
+NO_HEIGHT: Final = 1e3
+"""m, the sigma of a height that says nothing: far beyond what any height is uncertain by."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,6 +81,17 @@ class Fixes(Aid):
     def root_information(self) -> Array:
         """(M, 3, 3) 1/m."""
         return np.asarray(np.linalg.inv(np.linalg.cholesky(self.covariance_n)))
+
+    @property
+    def has_height(self) -> NDArray[np.bool_]:
+        """(M,) whether the height says anything."""
+        return np.asarray(np.trace(self.covariance_n, axis1=1, axis2=2) < NO_HEIGHT**2)
+
+    def without_height(self, which: NDArray[np.bool_], frame: LocalFrame) -> Self:
+        """Return the same with heights that say nothing where ``which`` (M,) is true."""
+        up_n = frame.R_nl_at(self.position_n)[..., 2] * which[:, None]
+        unknown = NO_HEIGHT**2 * up_n[:, :, None] * up_n[:, None, :]
+        return self._with({"covariance_n": self.covariance_n + unknown})
 
     @property
     def labels(self) -> list[str]:

@@ -55,6 +55,10 @@ LONGEST_LOCK_OUT_S: Final = 30.0
 """So long the inertial data are believed rather than beams that agree with each other."""
 LOCKED_OUT_FIXES: Final = 5
 LOCKED_OUT_DEPTHS: Final = 25
+VOUCHED_S: Final = 30.0
+"""So long a fix or a depth that agreed with the height vouches for it: depths, or fixes, that
+contradict it meanwhile contradict the rest as well, and it does not follow them. Dead reckoning
+alone does not lose a height by their gate within that."""
 DOUBT_FACTOR: Final = 2.0
 """What an answer in reserve says is doubted by so many of its sigmas, and attitude with a position
 that is contradicted."""
@@ -72,12 +76,13 @@ class Doubted(Enum):
     ANSWER = "everything since it was sound"
     VELOCITY = "everything since it was sound, and what the inertial data made of the velocity"
     POSITION = "position"
-    HEIGHT = "height"
+    HEIGHT = "height, which the depth contradicts"
+    HEIGHT_OF_FIXES = "height, which fixes contradict"
 
     @property
     def suspects(self) -> tuple[str, ...]:
         """Whose readings contradicted the answer, or may have bent it."""
-        if self is Doubted.POSITION:
+        if self in (Doubted.POSITION, Doubted.HEIGHT_OF_FIXES):
             return FIXES
         return (DEPTH,) if self is Doubted.HEIGHT else (DVL,)
 
@@ -124,7 +129,18 @@ def doubt_of(watch: Watch, sigma: Array, keyframe: Keyframe) -> Doubt | None:
     if watch.fixes_refused >= LOCKED_OUT_FIXES:
         reason = f"{watch.fixes_refused} GNSS fixes in a row contradict the position"
         return Doubt(Doubted.POSITION, reason)
-    if watch.depths_refused == LOCKED_OUT_DEPTHS:  # once: if that does not help, it is the sensor
+    return _doubt_of_height(watch, keyframe.time_s)
+
+
+def _doubt_of_height(watch: Watch, time_s: float) -> Doubt | None:
+    """Say why the height cannot be gone on from: what contradicts it, while nothing agrees."""
+    is_out = watch.heights_refused >= LOCKED_OUT_FIXES
+    if is_out and time_s - watch.last_depth_s > VOUCHED_S:
+        reason = f"{watch.heights_refused} GNSS fixes in a row contradict the height"
+        return Doubt(Doubted.HEIGHT_OF_FIXES, reason)
+    # Once: if that does not help, it is the sensor.
+    is_out = watch.depths_refused >= LOCKED_OUT_DEPTHS and not watch.depths_followed
+    if is_out and time_s - watch.last_height_s > VOUCHED_S:
         reason = f"the depth has contradicted the height {watch.depths_refused} times in a row"
         return Doubt(Doubted.HEIGHT, reason)
     return None
@@ -145,12 +161,12 @@ def watch_after(was: Watch, begun: Window, last: Stretch, doubt: Doubt) -> Watch
 
     ``begun`` is its window, ``last`` the newest keyframe before.
     """
-    newest, refusals = begun.newest, was.depths_refused
+    newest = begun.newest
     time_s = float(newest.time_s[0])
     is_aided = bool(np.any(newest.weight >= TRUSTED))
     is_grounded = counts_off_the_ground(newest, begun.keyframes[-1])
     contradicted, moved = was.contradicted, was.moved
-    if doubt.what in (Doubted.POSITION, Doubted.HEIGHT):
+    if doubt.what in (Doubted.POSITION, Doubted.HEIGHT, Doubted.HEIGHT_OF_FIXES):
         reckoned_n = last.states.p_n[0] + last.states.v_n[0] * (time_s - last.time_s[0])
         contradicted = Contradicted(
             time_s,
@@ -164,7 +180,10 @@ def watch_after(was: Watch, begun: Window, last: Stretch, doubt: Doubt) -> Watch
     return Watch(
         last_beam_s=time_s if is_aided else was.last_beam_s,
         last_ground_s=time_s if is_grounded else was.last_ground_s,
-        depths_refused=refusals + (refusals == LOCKED_OUT_DEPTHS),
+        depths_refused=was.depths_refused,
+        depths_followed=was.depths_followed or doubt.what is Doubted.HEIGHT,
+        last_height_s=was.last_height_s,
+        last_depth_s=was.last_depth_s,
         out_since_s=np.inf if is_aided else was.out_since_s,
         torn_since_s=was.torn_since_s,
         force=was.force,
@@ -178,7 +197,10 @@ def watch_after(was: Watch, begun: Window, last: Stretch, doubt: Doubt) -> Watch
 
 
 def is_astray(watch: Watch) -> bool:
-    """Return whether fixes have contradicted one answer after the other: the heading is wrong."""
+    """Return whether fixes have contradicted one answer after the other: the heading is wrong.
+
+    Those that contradict a height alone say nothing of it.
+    """
     return len(watch.moved) >= ASTRAY_TIMES
 
 
@@ -222,9 +244,11 @@ def _from_prediction(window: Window, keyframe: Keyframe, what: Doubted) -> Initi
         v_n = slowed(v_n)
         forget(P, VELOCITY, SPEED_SIGMA)
     else:
-        P[ROTATION, ROTATION] *= DOUBT_FACTOR**2
         up_b = R_nb[2]
-        unsure = np.eye(3) if what is Doubted.POSITION else np.outer(up_b, up_b)
+        unsure = np.outer(up_b, up_b)
+        if what is Doubted.POSITION:
+            P[ROTATION, ROTATION] *= DOUBT_FACTOR**2
+            unsure = np.eye(3)
         P[POSITION, POSITION] += POSITION_SIGMA**2 * unsure
     return InitialMoments(R_nb, p_n, v_n, bias, _regular(P), extra)
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
@@ -23,12 +24,14 @@ from ssm_graph.mission.calibration import (
     taken_as_exact,
     windowed,
 )
+from ssm_graph.mission.estimate import Estimate
 from ssm_graph.mission.events import EventLog
-from ssm_graph.mission.mission import InitialState, Mission
+from ssm_graph.mission.mission import Aids, InitialState, Mission
 from ssm_graph.mission.navigation import Severity
 from ssm_graph.mission.problem import Beams, ProblemConfig, build_problem_steps, initial_moments
 from ssm_graph.mission.start.alignment import SAFE_HEADING_SIGMA
 from ssm_graph.mission.vehicle import Vehicle
+from ssm_graph.sensors.depth import DEPTH
 from ssm_graph.sensors.imu import ImuLog
 from ssm_graph.smoothers.fixed_lag import run_fixed_lag_steps
 from ssm_graph.smoothers.keyframe import Sensors
@@ -166,9 +169,16 @@ class Starter:
     def _align_steps(self, mission: Mission) -> Steps[Beginning | None]:
         """Smooth what there is; begin at its end if that may be believed."""
         yield 1e-3 * len(mission.imu.time_s)  # for the mission itself
-        # Without the search for faults: it goes through all at once, and lanes watch from here on.
-        estimate = yield from smooth_steps(mission, SmootherConfig(), problem_config=self._config)
+        estimate = yield from self._smooth_steps(mission)
         sigma = float(estimate.trajectory.attitude_sigma[-1, 2])
+        is_surely_wrong = not estimate.status.is_good and not sigma > SAFE_HEADING_SIGMA
+        for name, rest in _with_one_less(mission) if is_surely_wrong else ():
+            with contextlib.suppress(SsmGraphError, np.linalg.LinAlgError):
+                other = yield from self._smooth_steps(rest)
+                if other.status.is_good:
+                    note = f"without {name}, which contradicts the rest"
+                    mission, estimate = rest, replace(other, notes=(*other.notes, note))
+                    break
         if not estimate.status.is_good or sigma > SAFE_HEADING_SIGMA:
             text = f"heading sigma {np.degrees(sigma):.0f} deg: {estimate.reason}; move while GNSS"
             self._wait(f"{text} is there")
@@ -186,6 +196,10 @@ class Starter:
         self._events.tell(self._now_s, Severity.INFO, "aligned", text)
         return Beginning(float(newest.time_s[-1]), moments, mission.frame, begin_s)
 
+    def _smooth_steps(self, mission: Mission) -> Steps[Estimate]:
+        # Without the search for faults: it goes through all at once, and lanes watch from here on.
+        return smooth_steps(mission, SmootherConfig(), problem_config=self._config)
+
     def _frame(self, buffers: Buffers) -> LocalFrame | None:
         if self._vehicle.frame is not None:
             return self._vehicle.frame
@@ -199,6 +213,18 @@ class Starter:
     def _wait(self, reason: str) -> None:
         self.reason = reason
         self._events.tell(self._now_s, Severity.INFO, "aligning", reason)
+
+
+def _with_one_less(mission: Mission) -> Iterator[tuple[str, Mission]]:
+    """Yield a mission without each sensor in turn that an answer can begin without, and its name.
+
+    DVL and GNSS it needs.
+    """
+    if mission.depth is not None:
+        yield DEPTH.section, replace(mission, depth=None)
+    for log in mission.aids:
+        others = (other for other in mission.aids if other is not log)
+        yield log.SECTION.strip("[]"), replace(mission, aids=Aids(*others))
 
 
 def extras_of_vehicle(vehicle: Vehicle) -> Extras:

@@ -77,7 +77,16 @@ class Watch(NamedTuple):
     out_since_s: float = math.inf
     """Since when no beam has agreed, s, also if the answer was begun anew meanwhile"""
     fixes_refused: int = 0
+    """In a row, as the next two"""
+    heights_refused: int = 0
+    """Fixes of which the height alone contradicts"""
     depths_refused: int = 0
+    depths_followed: bool = False
+    """Whether the height was begun anew where these put it"""
+    last_height_s: float = -math.inf
+    """When the height of a fix counted last, s"""
+    last_depth_s: float = -math.inf
+    """When a depth did"""
     good_share: float = 1.0
     """Running mean of the share of beams that count"""
     few_since_s: float = math.inf
@@ -123,7 +132,6 @@ def observe(
     """
     newest, time_s = window.newest, keyframe.time_s
     kept = window.keyframes[-1]
-    no_fix, no_depth = (_is_refused(newest, name) for name in (Fixes.name, DepthMeans.name))
     share = 1.0 - math.exp(-(time_s - last_s) / MEMORY_S)
     watch = watch._replace(force=watch.force + share * (force - watch.force))
     if len(newest.weight):
@@ -132,13 +140,7 @@ def observe(
             watch = watch._replace(last_ground_s=time_s)
     few_since_s = min(watch.few_since_s, time_s) if watch.good_share < FEW else math.inf
     watch = watch._replace(few_since_s=few_since_s)
-    if Fixes.name in keyframe.aids:
-        watch = watch._replace(
-            fixes_refused=watch.fixes_refused + 1 if no_fix else 0,
-            last_fix_s=watch.last_fix_s if no_fix else time_s,
-        )
-    if DepthMeans.name in keyframe.aids:
-        watch = watch._replace(depths_refused=watch.depths_refused + 1 if no_depth else 0)
+    watch = _with_heights(watch, keyframe, newest)
     of_place = (judged for name, judged in newest.aids.items() if name != DepthMeans.name)
     if any(np.any(judged.weight >= TRUSTED) for judged in of_place):
         watch = watch._replace(last_aid_s=time_s)
@@ -156,6 +158,32 @@ def _is_refused(newest: Stretch, name: str) -> bool:
     """Return whether nothing that an aid measured at the newest keyframe counts."""
     judged = newest.aids.get(name)
     return judged is None or bool(np.all(judged.weight < LOW_WEIGHT))
+
+
+def _with_heights(watch: Watch, keyframe: Keyframe, newest: Stretch) -> Watch:
+    """Return what is remembered after the fixes and the depth of one more keyframe."""
+    time_s, fixes = keyframe.time_s, keyframe.aids.get(Fixes.name)
+    if isinstance(fixes, Fixes):
+        is_refused = _is_refused(newest, Fixes.name)
+        watch = watch._replace(
+            fixes_refused=watch.fixes_refused + 1 if is_refused else 0,
+            last_fix_s=watch.last_fix_s if is_refused else time_s,
+        )
+        if not is_refused and fixes.has_height.any():
+            used = newest.aids[Fixes.name].aid
+            counts = isinstance(used, Fixes) and bool(used.has_height.any())
+            watch = watch._replace(
+                heights_refused=0 if counts else watch.heights_refused + 1,
+                last_height_s=time_s if counts else watch.last_height_s,
+            )
+    if DepthMeans.name in keyframe.aids:
+        is_refused = _is_refused(newest, DepthMeans.name)
+        watch = watch._replace(
+            depths_refused=watch.depths_refused + 1 if is_refused else 0,
+            depths_followed=watch.depths_followed and is_refused,
+            last_depth_s=watch.last_depth_s if is_refused else time_s,
+        )
+    return watch
 
 
 def _with_beams(
@@ -243,6 +271,11 @@ def _trouble(watch: Watch, time_s: float, v_n: Array) -> str:
         )
     if watch.fixes_refused:
         return f"{watch.fixes_refused} GNSS fixes in a row contradict the prediction"
+    if watch.heights_refused:
+        return (
+            f"the height of {watch.heights_refused} GNSS fixes in a row contradicts the prediction "
+            "and is left out"
+        )
     if watch.depths_refused:
         return f"{watch.depths_refused} keyframes in a row contradict the depth"
     if watch.misfit > MISFIT:

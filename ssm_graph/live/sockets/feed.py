@@ -13,6 +13,7 @@ from ssm_graph.live.protocols.decoder import Decoder
 from ssm_graph.live.protocols.framing import TokenBucket
 from ssm_graph.live.sockets.clocks import Now, StampClocks, called
 from ssm_graph.live.sockets.doubt import DOUBT_S
+from ssm_graph.live.sockets.places import Place, Places
 from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.navigation import Severity
 from ssm_graph.mission.run_status import LinkState, SourceStatus
@@ -59,8 +60,8 @@ class Limits:
 class Channel:
     """One connection's decoder, and when it last heard a sound message, s on the steady clock."""
 
-    def __init__(self, decoder: Decoder, now: Now) -> None:
-        self.decoder = decoder
+    def __init__(self, decoder: Decoder, now: Now, place: Place) -> None:
+        self.decoder, self.place = decoder, place
         self.heard_s = now.steady_s
         self.fed_s = now.steady_s
         self.is_stale = False
@@ -70,6 +71,11 @@ class Channel:
         """Take out a time in which nobody listened, s: what waits is stale, silence was none."""
         self.heard_s += span_s
         self.is_stale = True
+
+    def stand_for(self, channel: Channel) -> None:
+        """Take note of what has come by one of those that this one stands for."""
+        self.heard_s = max(self.heard_s, channel.heard_s)
+        self.fed_s = max(self.fed_s, channel.fed_s)
 
     def catch_up(self) -> None:
         """All that waited has been read."""
@@ -91,9 +97,10 @@ class Feed:
         limits: Limits,
         events: EventLog,
         clocks: StampClocks,
+        places: Places,
     ) -> None:
         self.name, self.address, self.limits = name, address, limits
-        self._clocks = clocks
+        self._clocks, self._places = clocks, places
         self.n_reconnects = 0
         self._make_decoder, self._events = make_decoder, events
         self._buckets: dict[type[Message], TokenBucket] = {}
@@ -102,9 +109,11 @@ class Feed:
         self._rate_hz, self._marked_s, self._n_marked = 0.0, -math.inf, 0
         self._altitude_m = math.nan
 
-    def channel(self, now: Now) -> Channel:
-        """Return the begin of a connection."""
-        return Channel(self._make_decoder(), now)
+    def channel(self, now: Now, caller: str = "", host: str = "") -> Channel:
+        """Return the begin of a connection; of one that others begin, with whom and from where."""
+        where = caller or self.address
+        place = Place(f"{self.name}, {where}", host and f"{self.name} {host}")
+        return Channel(self._make_decoder(), now, place)
 
     def take(self, channel: Channel, data: bytes, now: Now) -> list[Message]:
         """Return the messages that these bytes complete and that are not too many."""
@@ -128,7 +137,28 @@ class Feed:
         if decoder.n_sound > n_sound:
             channel.heard_s = now.steady_s
             self._altitude_m = decoder.altitude_m
-        return self._in_run_time(self._limited(messages, now), now)
+        return self._usable(channel, messages, now)
+
+    def _usable(self, channel: Channel, messages: list[Message], now: Now) -> list[Message]:
+        """Return messages of a connection that count, in the time of the run."""
+        heard = self._of_one_place(channel.place, messages, now)
+        return self._in_run_time(self._limited(heard, now), now)
+
+    def _of_one_place(self, place: Place, messages: list[Message], now: Now) -> list[Message]:
+        """Return messages without those of instruments that are heard from elsewhere, told."""
+        passed = []
+        refused: dict[str, Place] = {}
+        for message in messages:
+            heard = self._places.hear(place, message, now.steady_s)
+            passed += heard.passed
+            self._n_refused += heard.n_refused
+            if heard.instead is not None:
+                refused[called(message)] = heard.instead
+        for kind, other in refused.items():
+            text = f"{kind} from {place.name} refused: they come from {other.name}, which was heard"
+            text += " first; a vehicle has one of each instrument"
+            self.tell("second_source", text, Severity.WARNING)
+        return passed
 
     def _in_run_time(self, messages: list[Message], now: Now) -> list[Message]:
         """Return messages in the time of the run, without those of strange clocks, which is told.
@@ -174,14 +204,16 @@ class Feed:
 
     def held(self, channel: Channel, now: Now) -> list[Readings]:
         """Return complete messages that a decoder holds, as they would be read now."""
-        waiting = channel.decoder.waiting()
-        return [self._clocks.of(self.name, one).readings(one, now) for one in waiting]
+        waiting, place = channel.decoder.waiting(), channel.place
+        heard = [one for one in waiting if self._places.is_heard(place, type(one))]
+        heard += self._places.waiting(place)
+        return [self._clocks.of(self.name, one).readings(one, now) for one in heard]
 
     def end(self, channel: Channel, now: Now) -> list[Message]:
         """Return what the decoder of a connection that is over still gives."""
         messages = self.take(channel, b"\n", now)
         left = channel.decoder.take_waiting()
-        return messages + self._in_run_time(self._limited(left, now), now)
+        return messages + self._usable(channel, left, now)
 
     def is_over(self, now: Now) -> bool:
         """Return whether it has sent so many bytes that it has to wait."""

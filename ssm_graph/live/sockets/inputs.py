@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
 import selectors
 import socket
@@ -27,7 +28,7 @@ from ssm_graph.sensors.messages import Message, Readings
 YOUNG_S: Final = 2.0
 """A client that has sent no sound message for so long makes room for another one."""
 MAX_SENDERS: Final = 64
-"""Of datagrams, that are remembered while they have sent nothing for a while."""
+"""Of datagrams, that are told apart."""
 MAX_DATAGRAMS: Final = 512
 """Read of one source before the others have their turn."""
 
@@ -56,7 +57,7 @@ class Input(ABC):
     def stood_still(self, span_s: float) -> None:
         """Have nobody pay for the time in which this process did not listen."""
         self.feed.stood_still(span_s)
-        for channel in self._reading.values():
+        for channel in self._channels:
             channel.stand_still(span_s)
 
     def tick(self, now: Now) -> list[Message]:
@@ -85,18 +86,23 @@ class Input(ABC):
         """Return how it is doing."""
 
     @property
+    def _channels(self) -> tuple[Channel, ...]:
+        """All that is read of."""
+        return tuple(self._reading.values())
+
+    @property
     def is_behind(self) -> bool:
         """Whether what came while this process stood still is not read to its end."""
-        return any(channel.is_stale for channel in self._reading.values())
+        return any(channel.is_stale for channel in self._channels)
 
     @property
     def n_held(self) -> int:
         """Bytes held of messages that are not complete."""
-        return sum(channel.decoder.n_held for channel in self._reading.values())
+        return sum(channel.decoder.n_held for channel in self._channels)
 
     def waiting(self, now: Now) -> list[Readings]:
         """Return complete messages that decoders hold, as they would be read now."""
-        return [one for held in self._reading.values() for one in self.feed.held(held, now)]
+        return [one for held in self._channels for one in self.feed.held(held, now)]
 
     def abandon(self, sock: socket.socket) -> None:
         """Let go of a socket that made something fail."""
@@ -273,7 +279,7 @@ class TcpServerInput(Input):
         if client is not None:
             if silent and len(self._reading) >= self.feed.limits.max_clients:
                 messages = self._lose(silent, now, "it sent nothing sound and made room")
-            self._read_from(client, self.feed.channel(now))
+            self._read_from(client, self.feed.channel(now, *_caller(client)))
         return messages
 
     def tick(self, now: Now) -> list[Message]:
@@ -294,6 +300,7 @@ class TcpServerInput(Input):
 
     def _lose(self, sock: socket.socket, now: Now, why: str) -> list[Message]:
         self.feed.tell("connection_lost", f"a client is gone: {why}", Severity.WARNING)
+        self._reading[sock].place.leave()
         return self._end(sock, now)
 
 
@@ -308,15 +315,22 @@ class UdpInput(Input):
         super().__init__(feed, selector)
         self._socket = bound(endpoint)
         self.port = int(self._socket.getsockname()[1])
-        self._channel: Channel | None = None
+        self._all: Channel | None = None
+        """Stands for all senders, each of which has a channel of its own"""
+        self._senders: dict[str, Channel] = {}
         self._is_silent = False
         self._free_s: dict[str, float] = {}
         self._behind_s = 0.0
 
+    @property
+    def _channels(self) -> tuple[Channel, ...]:
+        return (*self._reading.values(), *self._senders.values())
+
     def on_ready(self, ready: socket.socket, now: Now) -> list[Message]:
         """Read what waits, so much of it."""
-        assert self._channel is not None
-        data, is_all = bytearray(), False
+        assert self._all is not None
+        data: dict[str, bytearray] = {}
+        n_bytes, is_all = 0, False
         for _ in range(MAX_DATAGRAMS):
             try:
                 datagram, sender = ready.recvfrom(CHUNK)
@@ -326,17 +340,37 @@ class UdpInput(Input):
             except OSError as error:  # an ICMP message about something else
                 self.feed.tell("receive_failed", error.strerror or str(error), Severity.WARNING)
                 break
-            if self._is_too_much(str(sender), len(datagram), now):
+            name = f"{sender[0]}:{sender[1]}"
+            if self._is_too_much(name, len(datagram), now):
                 continue
-            data += datagram if datagram.endswith(b"\n") else datagram + b"\n"
-            if len(data) >= CHUNK:
+            whole = datagram if datagram.endswith(b"\n") else datagram + b"\n"
+            data.setdefault(name, bytearray()).extend(whole)
+            n_bytes += len(whole)
+            if n_bytes >= CHUNK:
                 break
-        messages = self.feed.take(self._channel, bytes(data), now)
-        self._is_silent = self._is_silent and self.feed.is_silent(self._channel, now)
+        messages: list[Message] = []
+        for name, own in data.items():
+            channel = self._channel_of(name, now)
+            messages += self.feed.take(channel, bytes(own), now)
+            self._all.stand_for(channel)
+        self._is_silent = self._is_silent and self.feed.is_silent(self._all, now)
         if is_all:
-            self._channel.catch_up()
+            for channel in self._channels:
+                channel.catch_up()
             self._behind_s = 0.0
         return messages
+
+    def _channel_of(self, sender: str, now: Now) -> Channel:
+        """Return the channel of a sender; of too many the newest gives way."""
+        assert self._all is not None
+        if sender not in self._senders:
+            if len(self._senders) >= MAX_SENDERS:
+                _, last = self._senders.popitem()
+                last.place.leave()
+            channel = self._senders[sender] = self.feed.channel(now, f"sender {sender}", sender)
+            channel.heard_s = -math.inf
+            channel.is_stale = self._all.is_stale
+        return self._senders[sender]
 
     def stood_still(self, span_s: float) -> None:
         """Have nobody pay for the time in which this process did not listen."""
@@ -359,10 +393,15 @@ class UdpInput(Input):
 
     def tick(self, now: Now) -> list[Message]:
         """Say it where nothing comes any more."""
-        if self._channel is None:
-            self._channel = self.feed.channel(now)
-            self._read_from(self._socket, self._channel)
-        return super().tick(now)
+        if self._all is None:
+            self._all = self.feed.channel(now)
+            self._read_from(self._socket, self._all)
+        messages = super().tick(now)
+        for channel in self._senders.values():
+            if not self._all.is_stale:
+                channel.catch_up()
+            messages += self.feed.idle(channel, now)
+        return messages
 
     def status(self, now: Now) -> SourceStatus:
         """Return how it is doing."""
@@ -378,6 +417,15 @@ class UdpInput(Input):
             self._is_silent = True
             self.feed.tell("source_silent", f"{self.feed.address}: {why}", Severity.WARNING)
         return []
+
+
+def _caller(client: socket.socket) -> tuple[str, str]:
+    """Return who has called, for people, and the host; one that is gone already has none."""
+    try:
+        host, port = client.getpeername()[:2]
+    except OSError:
+        return "a client that is gone", ""
+    return f"client {host}:{port}", host
 
 
 def _fault_of(sock: socket.socket) -> int:

@@ -14,6 +14,7 @@ from ssm_graph.live.sockets.endpoints import Endpoint, Transport
 from ssm_graph.live.sockets.feed import Feed, Limits
 from ssm_graph.live.sockets.inputs import Input, TcpClientInput, TcpServerInput, UdpInput
 from ssm_graph.live.sockets.outputs import Output, OutputFormat, TcpServerOutput, UdpOutput
+from ssm_graph.live.sockets.places import Places
 from ssm_graph.live.sockets.serial_port import SerialInput
 from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.navigation import Event, Severity
@@ -72,7 +73,7 @@ class SocketHub:
         self._begin_s = self._polled_s = steady_s()
         self._clock = RunClock(wall_s, steady_s, set_by_s)
         self._note_clock = note_clock
-        self._stamps = StampClocks(self._clock)
+        self._stamps, self._places = StampClocks(self._clock), Places()
         self._events = EventLog(lambda: self.time_s, steady_s)
         self._selector = selectors.DefaultSelector()
         self.inputs: list[Input] = []
@@ -234,6 +235,7 @@ class SocketHub:
             limits=config.limits,
             events=self._events,
             clocks=self._stamps,
+            places=self._places,
         )
         kinds: dict[Transport, type[TcpClientInput | TcpServerInput | UdpInput | SerialInput]] = {
             Transport.TCP_CLIENT: TcpClientInput,

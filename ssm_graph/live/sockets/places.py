@@ -1,0 +1,171 @@
+"""Where an instrument is heard: a vehicle has one of each, and it speaks from one place at a time.
+
+A place is a connection, or a sender of datagrams. Of several that send messages of one kind the one
+that was heard first counts; the others are refused, which is told, and one of them is heard once
+the first has fallen silent. It gives way where the first is back. What a new one of the same host
+sends waits at first: a client may have called again before what it sent by its last call is read.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+from ssm_graph.sensors.messages import Message
+
+SILENT_S: Final = 1.0
+"""A place that is silent for so long may be left for another one."""
+SILENT_TIMES: Final = 3.0
+"""And for so many of its usual intervals."""
+LONGEST_INTERVAL_S: Final = 1.5
+"""No place is waited for longer than three of these."""
+WAITS_S: Final = 1.0
+"""So long messages of a new place wait to be those of the client that was heard so far."""
+MOST_WAITING: Final = 1000
+"""More are not of a client that has called again."""
+MOST_PLACES: Final = 16
+"""Of one kind of message that are remembered; the newest gives way, for the first ones count."""
+
+
+@dataclass(slots=True)
+class Place:
+    """One connection or sender, whatever kinds of messages it sends."""
+
+    name: str
+    """For people."""
+    host: str = ""
+    """Of a client that called, with the source: another call from there takes its place."""
+    is_left: bool = False
+    """Whether the connection is gone."""
+
+    def leave(self) -> None:
+        """Nothing more comes from here."""
+        self.is_left = True
+
+    def is_of_host(self, other: Place) -> bool:
+        """Return whether another one may be the same client."""
+        return bool(self.host) and self.host == other.host
+
+
+class Heard(NamedTuple):
+    """What becomes of a message, and of those before it that waited."""
+
+    passed: list[Message]
+    n_refused: int = 0
+    instead: Place | None = None
+    """Where the instrument is heard, if any were refused"""
+
+
+@dataclass(slots=True)
+class _Voice:
+    """What is remembered of one kind of message from a place, s on the steady clock."""
+
+    place: Place
+    heard_s: float = -math.inf
+    interval_s: float = 0.0
+    n_heard: int = 0
+    """Moments at which it was heard."""
+    waits_s: float = -math.inf
+    """When it was first not heard since the one before it was."""
+    met_s: float = math.inf
+    """When it was first not heard at all."""
+    waiting: list[Message] = field(default_factory=list)
+    is_strange: bool = False
+    """Whether it spoke for long while another one was heard."""
+
+    @property
+    def patience_s(self) -> float:
+        """How long it has to be silent before another one is heard."""
+        return max(SILENT_S, SILENT_TIMES * self.interval_s)
+
+    def hear(self, message: Message, steady_s: float) -> list[Message]:
+        """Take note that it speaks; return all that it has to say."""
+        if steady_s > self.heard_s:
+            if self.n_heard:
+                since_s = min(steady_s - self.heard_s, LONGEST_INTERVAL_S)
+                self.interval_s = max(since_s, 0.9 * self.interval_s)
+            self.n_heard += 1
+        self.heard_s, self.met_s, self.is_strange = steady_s, math.inf, False
+        waiting, self.waiting = self.waiting, []
+        return [*waiting, message]
+
+    def wait(self, message: Message, steady_s: float, before: Place) -> int:
+        """Have a message wait while it may be of the same client; return how many are refused."""
+        self.met_s = min(self.met_s, steady_s)
+        is_long = steady_s - self.met_s > WAITS_S or len(self.waiting) >= MOST_WAITING
+        self.is_strange = self.is_strange or is_long or not before.is_of_host(self.place)
+        if not self.is_strange:
+            self.waiting.append(message)
+            return 0
+        n_refused, self.waiting = len(self.waiting) + 1, []
+        return n_refused
+
+    def follow(self, place: Place, waiting: list[Message]) -> None:
+        """Speak from another place: the same client has called again."""
+        self.place, self.waiting = place, waiting
+
+    def waited_s(self, other: _Voice, steady_s: float) -> float:
+        """Return for how long it has spoken in vain since the other one was heard, s."""
+        if self.waits_s < other.heard_s:
+            self.waits_s = steady_s
+        return steady_s - self.waits_s
+
+
+class Places:
+    """All places of a run, by the kind of message, in the order in which they were heard first."""
+
+    def __init__(self) -> None:
+        self._voices: dict[type[Message], list[_Voice]] = {}
+
+    def hear(self, place: Place, message: Message, steady_s: float) -> Heard:
+        """Return what may pass now that a message has come from a place, and what is refused.
+
+        A sender that spoke once only, as one does that opens a socket for every datagram, keeps
+        nobody out.
+        """
+        voice, before = self._voice(place, type(message))
+        if before is None or self._is_silent(before, voice, steady_s):
+            return Heard(voice.hear(message, steady_s))
+        n_refused = voice.wait(message, steady_s, before.place)
+        return Heard([], n_refused, before.place if n_refused else None)
+
+    def waiting(self, place: Place) -> list[Message]:
+        """Return what waits of a place."""
+        voices = (voice for voices in self._voices.values() for voice in voices)
+        return [message for voice in voices if voice.place is place for message in voice.waiting]
+
+    def is_heard(self, place: Place, kind: type[Message]) -> bool:
+        """Return whether a message of this place would be heard now, as far as is known."""
+        others = self._voices.get(kind, [])
+        own = next((voice for voice in others if voice.place is place), None)
+        newest = max(others, key=lambda voice: voice.heard_s, default=None)
+        return own is newest or newest is None or newest.n_heard < 2
+
+    def _voice(self, place: Place, kind: type[Message]) -> tuple[_Voice, _Voice | None]:
+        """Return the voice of a place, and that which was heard last of those before it."""
+        voices = self._voices.setdefault(kind, [])
+        at = next((k for k, voice in enumerate(voices) if voice.place is place), len(voices))
+        if at == len(voices):
+            at = min(at, MOST_PLACES - 1)
+            voices[at:] = [_Voice(place)]
+        if not voices[at].is_strange:
+            others = (voice.place for voice in voices[:at])
+            left = (k for k, one in enumerate(others) if one.is_left and one.is_of_host(place))
+            before = next(left, at)
+            if before < at:
+                voices[before].follow(place, voices.pop(at).waiting)
+                at = before
+        known = (voice for voice in voices[:at] if voice.n_heard > 1)
+        return voices[at], max(known, key=lambda voice: voice.heard_s, default=None)
+
+    @staticmethod
+    def _is_silent(before: _Voice, voice: _Voice, steady_s: float) -> bool:
+        """Return whether a voice that was heard first has fallen silent for another one.
+
+        That one has to have waited for so long: where nobody has looked for a while, what comes
+        first says nothing of who is silent. Of a connection that is gone nothing more can come.
+        """
+        if before.place.is_left:
+            return steady_s - before.heard_s >= before.patience_s
+        return voice.waited_s(before, steady_s) >= before.patience_s

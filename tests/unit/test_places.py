@@ -1,0 +1,192 @@
+"""One instrument, several that claim to be it: who is heard, and when another one is."""
+
+from __future__ import annotations
+
+import socket
+from contextlib import ExitStack
+
+from ssm_graph.live.protocols.json_messages import JsonDecoder, encode_message
+from ssm_graph.live.sockets.endpoints import LOOPBACK, Endpoint, Transport
+from ssm_graph.live.sockets.inputs import MAX_SENDERS, TcpServerInput, UdpInput
+from ssm_graph.live.sockets.places import MOST_PLACES, SILENT_S, Place, Places
+from ssm_graph.live.sockets.sockets import InputConfig, SocketHub
+from ssm_graph.sensors.depth import DepthReading
+from ssm_graph.sensors.gnss import Fix
+from tests.instrument_fixture import Receiver, UdpSender
+
+WALL_S = 1_700_000_000.0
+FIX = Fix(1.0, 0.0, 0.0, 0.0, (1.0, 1.0, 1.0))
+
+
+class Turns:
+    """Places that speak of the depth, at times that a test sets."""
+
+    def __init__(self) -> None:
+        self.places, self.now_s = Places(), 0.0
+
+    def hears(self, place: Place, after_s: float = 0.1) -> bool:
+        """Return whether a place is heard, so long after the last one that spoke."""
+        return bool(self.passed(place, after_s))
+
+    def passed(self, place: Place, after_s: float = 0.1) -> int:
+        """Return how many messages of a place pass."""
+        self.now_s += after_s
+        return len(self.places.hear(place, DepthReading(self.now_s, 1.0), self.now_s).passed)
+
+
+def test_the_first_that_is_heard_counts() -> None:
+    """Whoever else speaks, however much; of another instrument he may be the first."""
+    turns, own, other = Turns(), Place("own"), Place("other")
+    assert turns.hears(own)
+    assert turns.hears(own)
+    assert not any(turns.hears(other, 0.001) for _ in range(90))
+    assert turns.hears(own)
+    assert turns.places.hear(other, FIX, turns.now_s).passed == [FIX]
+    assert turns.places.is_heard(own, DepthReading)
+    assert not turns.places.is_heard(other, DepthReading)
+
+
+def test_another_one_is_heard_where_the_first_is_silent_until_it_is_back() -> None:
+    """After a second and three intervals, which the other one has to have waited."""
+    turns, own, other = Turns(), Place("own"), Place("other")
+    assert all(turns.hears(own, 0.5) for _ in range(4))
+    assert not turns.hears(other, 60.0)  # nobody had looked: the first may have spoken as well
+    assert not turns.hears(other, 1.4)
+    assert turns.hears(other, 0.2)
+    assert turns.places.is_heard(other, DepthReading)
+    assert turns.hears(own)
+    assert not turns.hears(other)
+
+
+def test_a_client_that_calls_again_is_the_same() -> None:
+    """From its host; one that came in between does not take its turn."""
+    turns = Turns()
+    own, other = Place("own", "10.0.0.1"), Place("other", "10.0.0.2")
+    assert turns.hears(own)
+    assert turns.hears(own)
+    assert not turns.hears(other)
+    own.leave()
+    assert not turns.hears(other)
+    again = Place("own again", "10.0.0.1")
+    assert turns.hears(again)
+    assert not turns.hears(other, 0.9 * SILENT_S)
+    again.leave()
+    assert turns.hears(other, 1.1 * SILENT_S)
+
+
+def test_a_client_that_has_called_again_waits_for_the_end_of_its_last_call() -> None:
+    """What it sent before is read together with what it sends now, and nothing of it is lost."""
+    turns = Turns()
+    own, again = Place("own", "10.0.0.1"), Place("own again", "10.0.0.1")
+    assert turns.hears(own)
+    for _ in range(8):
+        assert turns.hears(own, 0.05)
+        assert not turns.hears(again, 0.05)
+    assert len(turns.places.waiting(again)) == 8
+    own.leave()
+    assert turns.passed(again) == 9
+    assert not turns.places.waiting(again)
+
+
+def test_who_spoke_beside_another_one_for_long_does_not_take_its_place() -> None:
+    """It leaves, and calls again: its turn is kept for a second, and what waited is refused."""
+    turns = Turns()
+    own, other = Place("own", "10.0.0.1"), Place("other", "10.0.0.1")
+    assert turns.hears(own)
+    refused = 0
+    for _ in range(15):
+        assert turns.hears(own, 0.05)
+        turns.now_s += 0.05
+        heard = turns.places.hear(other, DepthReading(turns.now_s, 2.0), turns.now_s)
+        assert not heard.passed
+        refused += heard.n_refused
+    assert refused == 15
+    assert heard.instead is own
+    own.leave()
+    assert not turns.hears(other)
+    assert turns.hears(Place("own again", "10.0.0.1"))
+
+
+def test_a_socket_for_every_datagram_keeps_nobody_out() -> None:
+    """Each of them speaks once; so many are remembered and no more."""
+    turns = Turns()
+    assert all(turns.hears(Place(str(k)), 0.1) for k in range(3 * MOST_PLACES))
+    assert len(turns.places._voices[DepthReading]) == MOST_PLACES
+
+
+class Steady:
+    """A clock that a test sets."""
+
+    now_s = 100.0
+
+    def __call__(self) -> float:
+        """Return seconds since some moment."""
+        return self.now_s
+
+
+def depth(clock: Steady, metres: float) -> bytes:
+    """Return a depth of now."""
+    return encode_message(DepthReading(WALL_S + clock.now_s, metres))
+
+
+def depths(receiver: Receiver) -> list[float]:
+    """Return the depths that came."""
+    return [message.depth for message in receiver.messages if isinstance(message, DepthReading)]
+
+
+def test_a_stranger_at_another_port_feeds_no_depths() -> None:
+    """Nor at the same one; what is refused is counted and told, with both places."""
+    clock = Steady()
+    kinds = (Transport.UDP, Transport.TCP_SERVER)
+    inputs = [InputConfig(kind.value, Endpoint(kind, LOOPBACK, 0), JsonDecoder) for kind in kinds]
+    wall_s = lambda: WALL_S + clock.now_s  # noqa: E731
+    with SocketHub(inputs, steady_s=clock, wall_s=wall_s) as hub, ExitStack() as stack:
+        receiver = Receiver(hub)
+        receiver.poll()
+        udp, tcp = hub.inputs
+        assert isinstance(udp, UdpInput)
+        assert isinstance(tcp, TcpServerInput)
+        own, stray = UdpSender(udp.port), UdpSender(udp.port)
+        stranger = stack.enter_context(socket.create_connection((LOOPBACK, tcp.port)))
+        for k in range(20):
+            clock.now_s += 0.1
+            own.send(depth(clock, 5.0))
+            receiver.until(lambda n=k: len(depths(receiver)) == n + 1)  # type: ignore[misc]
+            if k:
+                stray.send(depth(clock, 20.0))
+                stranger.sendall(50 * depth(clock, 20.0))
+            refused = [k, 50 * k]
+            receiver.until(lambda n=refused: [s.n_refused for s in hub.source_status()] == n)  # type: ignore[misc]
+        assert set(depths(receiver)) == {5.0}
+        said = [event.text for event in receiver.events if event.kind == "second_source"]
+        assert len(said) == 2
+        assert all("depth messages from" in text and "was heard first" in text for text in said)
+        for k in range(12):
+            clock.now_s += 0.1
+            stranger.sendall(depth(clock, 20.0))
+            receiver.until(lambda n=k: hub.source_status()[1].n_bytes > 950 * 50 + n)  # type: ignore[misc]
+        receiver.until(lambda: depths(receiver)[-1] == 20.0)
+        own.close()
+        stray.close()
+
+
+def test_datagrams_of_many_senders_are_told_apart_up_to_a_number() -> None:
+    """Halves of two senders do not meet, and the first of them stays."""
+    clock = Steady()
+    config = InputConfig("any", Endpoint(Transport.UDP, LOOPBACK, 0), JsonDecoder)
+    with SocketHub([config], steady_s=clock, wall_s=lambda: WALL_S + clock.now_s) as hub:
+        receiver = Receiver(hub)
+        receiver.poll()
+        (source,) = hub.inputs
+        assert isinstance(source, UdpInput)
+        own = UdpSender(source.port)
+        for k in range(MAX_SENDERS + 20):
+            clock.now_s += 0.01
+            own.send(depth(clock, 5.0))
+            receiver.until(lambda n=k: len(depths(receiver)) == n + 1)  # type: ignore[misc]
+            other = UdpSender(source.port)
+            other.send(b"{")
+            other.close()
+        receiver.until(lambda: hub.source_status()[0].n_refused >= MAX_SENDERS)
+        assert len(source._senders) <= MAX_SENDERS
+        own.close()
