@@ -15,6 +15,7 @@ from rich.text import Text
 from ssm_graph.base.times import UNIX_FROM_S, UNIX_UNTIL_S
 from ssm_graph.cli.terminal import say, say_json
 from ssm_graph.io.file_kind import check_is_file
+from ssm_graph.report.clock import clocked
 from ssm_graph.report.terminal.progress import ProgressDisplay
 
 DESCRIPTION = """\
@@ -112,7 +113,8 @@ def _tell(found: Any, console: Console) -> None:
         for fact in one.facts:
             say(console, f"  {one.name}: {fact}")
         for odd in one.oddities:
-            console.print(Text(f"  {one.name}: {odd}", style="yellow"), soft_wrap=True)
+            text = clocked(odd, found.sensors[0].timing.begin_s)
+            console.print(Text(f"  {one.name}: {text}", style="yellow"), soft_wrap=True)
     for note in found.notes:
         console.print(Text(f"note: {note}", style="yellow"), soft_wrap=True)
     for suspect in found.suspects:

@@ -30,6 +30,11 @@ _KINDS: Final = (
     (b"PAR1", "a Parquet table: say what its columns are, with  --map"),
     (b"\x89HDF\r\n", "an HDF5 file: say what its columns are, with  --map"),
     (b"MATLAB", "a MAT file: say what its columns are, with  --map"),
+    (b"CDF", "a classic NetCDF file: bring it to NetCDF 4 with  nccopy -k nc4, then  --map"),
+    (b"\x89PNG", "an image"),
+    (b"\xff\xd8\xff", "an image"),
+    (b"%PDF", "a PDF"),
+    (b"<?xml", "XML"),
 )
 
 
@@ -50,7 +55,8 @@ def kind_of(path: Path) -> str:
         n_tables = sum(one.suffix.lower() in CSV_ENDINGS for one in path.iterdir())
         if n_tables:
             return (
-                f"a folder of {n_tables} tables: say what their columns are, with  --map  "
+                f"a folder with {n_tables} table{'s' * (n_tables > 1)}: say what the columns are, "
+                "with  --map  "
                 f"(ssm-graph template, ssm-graph inspect {path} --draft-map map.toml); else "
                 f"expected {READ}"
             )

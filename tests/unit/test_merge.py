@@ -83,6 +83,32 @@ def test_the_mission_is_the_one_that_both_are_of(folder: Path, tmp_path: Path) -
     np.testing.assert_allclose(off_s, 0.0, atol=1e-5)
 
 
+def test_tables_of_any_columns_join_a_recording(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A map without a DVL, whose recording lies beside the tables; without one it is refused."""
+    imu = sim().mission.imu
+    flu = np.array([1.0, -1.0, -1.0])
+    rows = np.column_stack([1e3 * imu.time_s, np.degrees(imu.gyro_b) * flu, imu.accel_b * flu])
+    head = "t_ms,wx,wy,wz,ax,ay,az"
+    np.savetxt(tmp_path / "own.csv", rows, "%.12g", ",", header=head, comments="")
+    (tmp_path / "map.toml").write_text(
+        'format = 1\n[imu]\ntime = { column = "t_ms", unit = "ms" }\n'
+        'gyro = { columns = ["wx", "wy", "wz"], unit = "deg/s", axes = "FLU" }\n'
+        'accel = { columns = ["ax", "ay", "az"], axes = "FLU" }\n'
+    )
+    words = ["convert", "--map", str(tmp_path / "map.toml"), "--vehicle", str(folder / "mission")]
+    words += ["--out", str(tmp_path / "out"), str(tmp_path / "own.csv")]
+    assert main(words) == 2
+    assert "or the recording of a DVL beside the tables" in capsys.readouterr().err
+    assert main([*words, str(folder / "dvl.json")]) == 0
+    assert "onto the clock of the IMU" in capsys.readouterr().out
+    found = read_mission(tmp_path / "out")
+    np.testing.assert_allclose(found.imu.gyro_b, imu.gyro_b, atol=1e-9)
+    np.testing.assert_array_equal(found.dvl.speed, sim().mission.dvl.speed)
+    assert np.abs(found.dvl.time_s - sim().mission.dvl.time_s).max() < 0.02
+
+
 def test_offset_and_its_sigma() -> None:
     """Over many noises: right on the mean, and as uncertain as is said, to a factor of three."""
     imu, time_s = sim().mission.imu, np.arange(1.0, 79.0, 0.2)
