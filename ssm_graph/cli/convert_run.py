@@ -33,6 +33,7 @@ from ssm_graph.live.recorded.merge import (
     merge_columns,
     merge_recordings,
     mission_of_recording,
+    not_tables,
 )
 from ssm_graph.mission.mission import Mission
 from ssm_graph.report.terminal.progress import ProgressDisplay
@@ -157,17 +158,15 @@ def _from_tables(
         if not log.is_file():
             raise DataError(f"{log}: expected a file with columns")
     vehicle = read_vehicle(path)
-    with ProgressDisplay(errors) as show:
-        show.stage("looking for recordings among the files")
-        merged = merge_columns(
-            arguments.log,
-            column_map,
-            arguments.out,
-            vehicle=vehicle,
-            offset_s=arguments.clock_offset,
-        )
-    if merged is not None:
-        return _said(merged, arguments, console)
+    if not_tables(arguments.log, column_map):
+        with ProgressDisplay(errors) as show:
+            show.stage("reading and joining the logs")
+            offset_s, out = arguments.clock_offset, arguments.out
+            merged = merge_columns(
+                arguments.log, column_map, out, vehicle=vehicle, offset_s=offset_s
+            )
+        if merged is not None:
+            return _said(merged, arguments, console)
     if arguments.clock_offset is not None:
         raise ConfigError("--clock-offset: of tables with a map, time has the key offset_s")
     return write(lambda: convert_columns(arguments.log, column_map, vehicle, name=vehicle.name))

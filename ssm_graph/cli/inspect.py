@@ -89,9 +89,13 @@ def _draft(path: Path, out: Path, errors: Console) -> None:
 def _tell(found: Any, console: Console) -> None:
     say(console, f"{found.path}: {found.kind}")
     if found.sensors:
+        begins_s = (one.timing.begin_s for one in found.sensors if one.timing.n)
+        begin_s = min(begins_s, default=0.0)
+        if UNIX_FROM_S <= begin_s <= UNIX_UNTIL_S:
+            day = datetime.fromtimestamp(begin_s, UTC)
+            say(console, f"  begins {day:%Y-%m-%d %H:%M:%S} UTC")
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
         table.add_column("sensor", style="bold")
-        begin_s = found.sensors[0].timing.begin_s
         clock = "UTC" if UNIX_FROM_S <= begin_s <= UNIX_UNTIL_S else "s"
         headings = ("rows", f"from, {clock}", f"to, {clock}", "rate, Hz", "jitter, ms", "gaps")
         for heading in (*headings, "in gaps, s"):
@@ -113,7 +117,7 @@ def _tell(found: Any, console: Console) -> None:
         for fact in one.facts:
             say(console, f"  {one.name}: {fact}")
         for odd in one.oddities:
-            text = clocked(odd, found.sensors[0].timing.begin_s)
+            text = clocked(odd, begin_s)
             console.print(Text(f"  {one.name}: {text}", style="yellow"), soft_wrap=True)
     for note in found.notes:
         console.print(Text(f"note: {note}", style="yellow"), soft_wrap=True)

@@ -17,12 +17,13 @@ from ssm_graph.base.progress import told
 from ssm_graph.inspection.sensors import SensorFound, sensors_in, sensors_of
 from ssm_graph.inspection.timing import timing_of
 from ssm_graph.io.ardupilot.convert import convert_ardupilot, is_ardupilot
+from ssm_graph.io.ardupilot.dataflash import is_dataflash
 from ssm_graph.io.blueye.convert import convert_blueye
 from ssm_graph.io.columns.convert import times
 from ssm_graph.io.columns.draft import guess_sections, guess_time
 from ssm_graph.io.columns.map_file import Times
 from ssm_graph.io.columns.sources import ENDINGS, read_source
-from ssm_graph.io.file_kind import is_mcap, kind_of
+from ssm_graph.io.file_kind import first_bytes, is_mcap, kind_of
 from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.io.mission_folder.toml import TOML_NAME
 from ssm_graph.io.ros.convert import convert_rosbag
@@ -143,11 +144,13 @@ def _reader(path: Path) -> tuple[str, Any]:
     if is_mission_folder(path):
         return "mission folder", lambda p: read_mission(p if p.is_dir() else p.parent)
     if is_rosbag(path):
-        return "ROS bag", convert_rosbag
+        number = 1 if first_bytes(path).startswith(b"#ROSBAG") else 2
+        return f"ROS {number} bag", convert_rosbag
     if path.is_file() and is_mcap(path):
         return "Blueye X3 log (MCAP)", convert_blueye
     if path.is_file() and is_ardupilot(path):
-        return "ArduPilot log", convert_ardupilot
+        kind = "dataflash" if is_dataflash(first_bytes(path)) else "telemetry"
+        return f"ArduPilot {kind} log", convert_ardupilot
     return "", None
 
 

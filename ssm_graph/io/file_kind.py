@@ -46,7 +46,7 @@ def check_is_file(path: Path) -> None:
 
 def is_mcap(path: Path) -> bool:
     """Return whether a file begins as MCAP does."""
-    return _head(path).startswith(_MCAP)
+    return first_bytes(path).startswith(_MCAP)
 
 
 def kind_of(path: Path) -> str:
@@ -61,7 +61,7 @@ def kind_of(path: Path) -> str:
                 f"expected {READ}"
             )
         return f"a folder without .mcap or .db3 files; expected {READ}"
-    head = _head(path)
+    head = first_bytes(path)
     if not head:
         return f"empty, or it cannot be read; expected {READ}"
     for begin, what in _KINDS:
@@ -84,7 +84,8 @@ def _is_mavlink(head: bytes) -> bool:
     return head[:1] in (b"\xfd", b"\xfe")
 
 
-def _head(path: Path) -> bytes:
+def first_bytes(path: Path) -> bytes:
+    """Return what a file begins with, nothing of one that cannot be read."""
     try:
         with path.open("rb") as stream:
             return stream.read(32)

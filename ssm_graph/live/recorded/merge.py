@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fnmatch import fnmatch
 from heapq import merge
@@ -98,7 +98,8 @@ def merge_columns(
     column_map : what the columns of the tables are.
     out, vehicle, offset_s : as of :func:`merge_recordings`.
     """
-    recordings = dict(_recordings(files, column_map))
+    found = {file: read_recorded(file) for file in not_tables(files, column_map)}
+    recordings = {file: one for file, one in found.items() if one is not None}
     if not recordings:
         return None
     tables = [file for file in files if file not in recordings]
@@ -108,19 +109,23 @@ def merge_columns(
             f"{column_map.path.name} [reference]: not beside recordings: convert without it, and "
             "put the table and its section of mission.toml into the folder"
         )
-    found = _joined(mapped.logs, recordings, out, vehicle=vehicle, offset_s=offset_s)
-    return Merged(found.mission, (*mapped.notes, *found.notes))
+    made = _joined(mapped.logs, recordings, out, vehicle=vehicle, offset_s=offset_s)
+    return Merged(made.mission, (*mapped.notes, *made.notes))
 
 
-def _recordings(files: Sequence[Path], column_map: ColumnMap) -> Iterator[tuple[Path, Recorded]]:
-    """Yield the files that are recordings of instruments, with what they hold."""
+def not_tables(files: Sequence[Path], column_map: ColumnMap) -> list[Path]:
+    """Return the files beside the tables of a map that may be recordings.
+
+    No section names them; of a map with a DVL they have the ending of no table either.
+    """
     has_dvl = "dvl" in {section.name for section in column_map.sections}
-    for file in files:
-        is_named = any(one.file and fnmatch(file.name, one.file) for one in column_map.sections)
-        may_be_table = has_dvl and file.suffix.lower() in ENDINGS
-        found = None if is_named or may_be_table else read_recorded(file)
-        if found is not None:
-            yield file, found
+    patterns = [section.file for section in column_map.sections if section.file]
+    return [
+        file
+        for file in files
+        if not any(fnmatch(file.name, pattern) for pattern in patterns)
+        and not (has_dvl and file.suffix.lower() in ENDINGS)
+    ]
 
 
 def _joined(
