@@ -53,7 +53,7 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     check_is_file(arguments.path)
     with ProgressDisplay(errors) as show:
         show.stage(f"reading {arguments.path}")
-        found = inspect_path(arguments.path)
+        found = inspect_path(arguments.path, show.stage)
     if arguments.draft_map is not None:
         _draft(arguments.path, arguments.draft_map, errors)
     if arguments.json:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -122,10 +122,15 @@ def is_mission_folder(path: Path) -> bool:
     return (path / TOML_NAME).is_file() or path.name == TOML_NAME
 
 
-def inspect_path(path: Path) -> Inspection:
+def inspect_path(path: Path, stage: Callable[[str], None] | None = None) -> Inspection:
     """Look at a file, folder, bag or mission; what cannot be read is said, not raised.
 
     Raises :class:`DataError` only where there is nothing at the path.
+
+    Parameters
+    ----------
+    path : what to look at.
+    stage : is told what is done next, for a display.
     """
     if not path.exists():
         raise DataError(f"{path}: there is no such file or folder")
@@ -136,6 +141,8 @@ def inspect_path(path: Path) -> Inspection:
         mission = read(path)
     except SsmGraphError as error:
         return Inspection(path, kind, (), (), (), (str(error),), None)
+    if stage is not None:
+        stage("comparing clocks, units and axes")
     return inspect_mission(mission, path, kind)
 
 

@@ -150,7 +150,7 @@ def _depth(log: Any, _: LocalFrame) -> Found:
         f"repeats {log.depth[begin]:.3f} m from {log.time_s[begin]:.1f} to {log.time_s[end]:.1f} s"
         for begin, end in runs[:3]
     ]
-    facts = (f"{log.depth.min():.2f} to {log.depth.max():.2f} m",)
+    facts = (f"{log.depth.min():z.2f} to {log.depth.max():z.2f} m",)
     return facts, tuple(oddities), {"depth, m": log.depth}
 
 
@@ -160,7 +160,7 @@ def _gnss(log: Any, frame: LocalFrame) -> Found:
     sigma = np.median(np.asarray(log.sigma_enu), axis=0)
     facts = (
         f"within {extent[0]:.0f} m east and {extent[1]:.0f} m north, heights "
-        f"{log.height.min() + 0.0:.1f} to {log.height.max() + 0.0:.1f} m",
+        f"{log.height.min():z.1f} to {log.height.max():z.1f} m",
         f"stated sigma {sigma[0]:.2f}, {sigma[1]:.2f}, {sigma[2]:.2f} m east, north, up",
     )
     off = np.hypot(enu[:, 0] - enu[0, 0], enu[:, 1] - enu[0, 1])

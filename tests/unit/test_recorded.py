@@ -63,6 +63,15 @@ def nmea(*bodies: str) -> bytes:
     return "".join(f"${body}*{checksum(body)}\r\n" for body in bodies).encode()
 
 
+def test_pings_of_another_number_of_beams_are_left_out(tmp_path: Path) -> None:
+    """One table has one number of columns."""
+    three = [{**one, "transducers": one["transducers"][:3]} for one in reports(9, "json_v3")[6:]]
+    lines = [json.dumps(one) for one in [*reports(6, "json_v3"), *three]]
+    found = read(tmp_path / "dvl.json", "\n".join(lines).encode())
+    assert {len(one.speed) for one in found.messages if isinstance(one, Ping)} == {4}
+    assert "6 pings are of 4 beams; 3 of 3 were left out: of another instrument?" in found.notes
+
+
 def test_reports_without_a_clock_are_timed_by_their_sum(tmp_path: Path) -> None:
     """Format json_v1: repeats add nothing, and the note says what the times are."""
     lines = [json.dumps(one) for one in reports(5)]

@@ -122,7 +122,19 @@ def read_recorded(log: Path, options: NmeaOptions | None = None) -> Recorded | N
     if pings and not any(math.isfinite(speed) for ping in pings for speed in ping.speed):
         said = f"{len(pings)} pings and not one speed along a beam: the bottom was never in range?"
         found = replace(found, notes=(said, *found.notes))
-    return _in_order(log, found)
+    return _in_order(log, _of_one_dvl(found))
+
+
+def _of_one_dvl(found: Recorded) -> Recorded:
+    """Return a recording without pings of another number of beams than most have."""
+    counts = Counter(len(one.speed) for one in found.messages if isinstance(one, Ping))
+    if len(counts) < 2:
+        return found
+    (n_beams, n_pings), *others = counts.most_common()
+    said = " and ".join(f"{count} of {n}" for n, count in others)
+    note = f"{n_pings} pings are of {n_beams} beams; {said} were left out: of another instrument?"
+    kept = [one for one in found.messages if not isinstance(one, Ping) or len(one.speed) == n_beams]
+    return Recorded(found.about, tuple(kept), (*found.notes, note))
 
 
 def _in_utf8(data: bytes) -> bytes:
