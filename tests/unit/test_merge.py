@@ -15,8 +15,10 @@ from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.cli.main import ExitCode, main
 from ssm_graph.io.mission_folder.folder import read_mission, write_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle
+from ssm_graph.io.raw_log.log import RawLog
 from ssm_graph.live.recorded.merge import merge_recordings
 from ssm_graph.live.recorded.turns import clock_offset
+from ssm_graph.sensors.messages import Message
 from ssm_graph.simulation import CALM, SimulatedMission, SurveyRoute
 from tests.helpers import simulated
 
@@ -81,6 +83,26 @@ def test_the_mission_is_the_one_that_both_are_of(folder: Path, tmp_path: Path) -
     stated = merge_recordings(logs, tmp_path / "by", vehicle=vehicle, offset_s=-AHEAD_S)
     off_s = stated.mission.dvl.time_s - mission.dvl.time_s
     np.testing.assert_allclose(off_s, 0.0, atol=1e-5)
+
+
+def test_an_interrupted_merge_leaves_nothing(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A mission that lacks its end would look like a whole one."""
+    append, n_rows = RawLog.append, 0
+
+    def stop(self: RawLog, message: Message) -> None:
+        nonlocal n_rows
+        n_rows += 1
+        if n_rows > 50:
+            raise KeyboardInterrupt
+        append(self, message)
+
+    monkeypatch.setattr(RawLog, "append", stop)
+    logs = [folder / "dvl.json", folder / "mission" / "imu.csv"]
+    with pytest.raises(KeyboardInterrupt):
+        merge_recordings(logs, tmp_path / "out", vehicle=read_vehicle(folder / "mission"))
+    assert not [*tmp_path.iterdir()]
 
 
 def test_tables_of_any_columns_join_a_recording(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fnmatch import fnmatch
@@ -14,10 +16,12 @@ import numpy as np
 
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frames import BodyAxes
+from ssm_graph.base.progress import told
 from ssm_graph.io.columns.convert import logs_of_columns
 from ssm_graph.io.columns.map_file import ColumnMap
 from ssm_graph.io.columns.sources import ENDINGS
 from ssm_graph.io.mission_folder.folder import read_mission
+from ssm_graph.io.mission_folder.toml import TOML_NAME
 from ssm_graph.io.raw_log.log import RawLog
 from ssm_graph.io.tables.files import read_table
 from ssm_graph.live.recorded.log import Recorded, read_recorded
@@ -165,10 +169,21 @@ def mission_of_recording(log: Path, found: Recorded, out: Path, *, vehicle: Vehi
 
 
 def _written(streams: Sequence[Sequence[Message]], out: Path, vehicle: Vehicle) -> Mission:
-    with RawLog(out, vehicle) as raw:
-        for message in merge(*streams, key=lambda message: message.time_s):
-            raw.append(message)
-    return read_mission(out)
+    """Write a mission folder, whole or not at all, and return what is in it."""
+    part = out.with_name(f".{out.name}.part-{os.getpid()}")
+    ordered = merge(*streams, key=lambda message: message.time_s)
+    try:
+        with RawLog(part, vehicle) as raw:
+            for message in told(ordered, sum(map(len, streams))):
+                raw.append(message)
+        mission = read_mission(part)
+        out.mkdir(parents=True, exist_ok=True)
+        (out / TOML_NAME).unlink(missing_ok=True)
+        for file in sorted(part.iterdir(), key=lambda file: file.name == TOML_NAME):
+            file.replace(out / file.name)
+        return mission
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
 
 
 def _is_inertial(log: Path) -> bool:
