@@ -14,6 +14,8 @@ READ: Final = (
     "reports, NMEA 0183, or tables with  --map"
 )
 _MCAP: Final = b"\x89MCAP0\r\n"
+_REMARKS: Final = 4096
+"""Bytes in which remarks before the content end."""
 _COMPRESSED: Final = "a compressed file: unpack it first"
 _KINDS: Final = (
     (b"#ROSBAG V1", "a ROS 1 bag of version 1: bring it to 2.0 with  rosbag fix"),
@@ -26,6 +28,8 @@ _KINDS: Final = (
     (b"ULog\x01\x12\x35", "a PX4 ULog: export its tables with  ulog2csv"),
     (b"\x7f\x7f", "like Teledyne PD0, but its first ensemble is damaged"),
     (b"\xb5\x62", "binary of a u-blox receiver: have it write NMEA, or convert it"),
+    (b"\xa0\xa2", "binary of a SiRF receiver: have it write NMEA, or convert it"),
+    (b"\xd3\x00", "RTCM 3, corrections of a receiver: have it write NMEA beside them"),
     (b"SQLite format 3\0", "an SQLite database: a ROS 2 bag has it under the name .db3"),
     (b"PAR1", "a Parquet table: say what its columns are, with  --map"),
     (b"\x89HDF\r\n", "an HDF5 file: say what its columns are, with  --map"),
@@ -61,7 +65,7 @@ def kind_of(path: Path) -> str:
                 f"expected {READ}"
             )
         return f"a folder without .mcap or .db3 files; expected {READ}"
-    head = first_bytes(path)
+    head = _after_remarks(path)
     if not head:
         return f"empty, or it cannot be read; expected {READ}"
     for begin, what in _KINDS:
@@ -77,6 +81,21 @@ def kind_of(path: Path) -> str:
     if head.startswith(_MCAP):
         return f"MCAP without messages of ROS 2; expected {READ}"
     return f"of no known kind, it begins with {head[:12]!r}; expected {READ}"
+
+
+def _after_remarks(path: Path) -> bytes:
+    """Return what stands in a file behind the remarks that somebody put before it."""
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(_REMARKS)
+    except OSError:
+        return b""
+    rest = head
+    while (
+        rest.startswith((b"#", b"\n", b"\r")) and not rest.startswith(b"#ROSBAG") and b"\n" in rest
+    ):
+        rest = rest.partition(b"\n")[2]
+    return rest or head
 
 
 def _is_mavlink(head: bytes) -> bool:
