@@ -67,7 +67,7 @@ class Content:
     @property
     def horizontal_sigma_m(self) -> Array:
         """(N,) root of the mean of the east and north variances: of a circle that is as large."""
-        return np.sqrt(0.5) * self._distance_rms_m
+        return np.asarray(np.sqrt(0.5) * self._distance_rms_m)
 
     @property
     def radius_95_m(self) -> Array:
@@ -77,9 +77,9 @@ class Content:
         the same mean square in both directions stay inside it in up to 97.9 %: the tables hold
         sigmas along east and north, not how the two errors go together.
         """
-        return Z95 * self._distance_rms_m
+        return np.asarray(Z95 * self._distance_rms_m)
 
     @property
     def _distance_rms_m(self) -> Array:
         rows = self.trajectory
-        return np.hypot(rows["sigma_east_m"], rows["sigma_north_m"])
+        return np.asarray(np.hypot(rows["sigma_east_m"], rows["sigma_north_m"]))
