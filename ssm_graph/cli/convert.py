@@ -28,8 +28,9 @@ Convert a log. LOG is one of
   tables of any    CSV, Parquet, MAT, HDF5 (extra 'columns'), with --map map.toml, which says what
   columns          their columns are: ssm-graph template writes one to fill in, ssm-graph inspect
                    FILE --draft-map drafts one of a table
-  several files    a table with the columns of imu.csv and recordings as above, with --vehicle: one
-                   mission on the clock of the IMU, the others moved by the turns they show
+  several files    inertial data in a table with the columns of imu.csv, or in any columns with
+                   --map, and recordings as above, with --vehicle: one mission on the clock of the
+                   IMU, the others moved by the turns they show
 
 Of a ROS bag, topics are found by their type:
 
@@ -44,6 +45,7 @@ examples:
   ssm-graph convert 00000042.BIN --out MISSION
   ssm-graph convert --map map.toml imu.csv dvl.csv gps.csv --out MISSION
   ssm-graph convert imu.csv survey.PD0 --vehicle vehicle.toml --out MISSION
+  ssm-graph convert --map map.toml own_imu.csv survey.PD0 --out MISSION
 """
 
 

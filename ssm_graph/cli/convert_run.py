@@ -28,7 +28,13 @@ from ssm_graph.io.ros.convert import convert_rosbag
 from ssm_graph.io.ros.log import is_rosbag
 from ssm_graph.io.ros.messages import BeamSign, RosOptions
 from ssm_graph.live.recorded.log import Recorded, read_recorded, write_tables
-from ssm_graph.live.recorded.merge import Merged, merge_recordings, mission_of_recording
+from ssm_graph.live.recorded.merge import (
+    Merged,
+    merge_columns,
+    merge_recordings,
+    mission_of_recording,
+    not_tables,
+)
 from ssm_graph.mission.mission import Mission
 from ssm_graph.report.terminal.progress import ProgressDisplay
 from ssm_graph.sensors.dvl import Ping
@@ -49,7 +55,7 @@ def convert(arguments: argparse.Namespace, console: Console, errors: Console) ->
         if log.exists() and arguments.out.resolve() == log.resolve():
             raise ConfigError(f"--out: expected another folder than that of LOG: {arguments.out}")
     if arguments.map is not None:
-        return write(lambda: _from_columns(arguments))
+        return _from_tables(arguments, write, console, errors)
     if len(arguments.log) > 1:
         return _merge(arguments, console, errors)
     (log,) = arguments.log
@@ -133,11 +139,14 @@ def _vehicle_path(arguments: argparse.Namespace) -> Path | None:
     return read_map(arguments.map).vehicle
 
 
-def _from_columns(arguments: argparse.Namespace) -> Mission:
-    """Return the mission of tables of any columns."""
+def _from_tables(
+    arguments: argparse.Namespace,
+    write: Callable[[Callable[[], Mission]], bool],
+    console: Console,
+    errors: Console,
+) -> bool:
+    """Write the mission of tables of any columns, and of recordings beside them."""
     _refuse_ros_options(arguments.log[0], arguments, ROS_OPTIONS[1:])
-    if arguments.clock_offset is not None:
-        raise ConfigError("--clock-offset: of tables with a map, time has the key offset_s")
     column_map = read_map(arguments.map)
     path = _vehicle_path(arguments)
     if path is None:
@@ -149,7 +158,18 @@ def _from_columns(arguments: argparse.Namespace) -> Mission:
         if not log.is_file():
             raise DataError(f"{log}: expected a file with columns")
     vehicle = read_vehicle(path)
-    return convert_columns(arguments.log, column_map, vehicle, name=vehicle.name)
+    if not_tables(arguments.log, column_map):
+        with ProgressDisplay(errors) as show:
+            show.stage("reading and joining the logs")
+            offset_s, out = arguments.clock_offset, arguments.out
+            merged = merge_columns(
+                arguments.log, column_map, out, vehicle=vehicle, offset_s=offset_s
+            )
+        if merged is not None:
+            return _said(merged, arguments, console)
+    if arguments.clock_offset is not None:
+        raise ConfigError("--clock-offset: of tables with a map, time has the key offset_s")
+    return write(lambda: convert_columns(arguments.log, column_map, vehicle, name=vehicle.name))
 
 
 def _write(
@@ -199,7 +219,7 @@ def _write_tables(recorded: Recorded, out: Path, console: Console) -> bool:
         else "imu.csv and mission.toml beside them make"
     )
     say(console, f"{out}: {rows}; {lacking} a mission")
-    _say_notes(recorded.notes, console)
+    _say_notes(recorded.told, console)
     return True
 
 

@@ -15,6 +15,7 @@ from rich.text import Text
 from ssm_graph.base.times import UNIX_FROM_S, UNIX_UNTIL_S
 from ssm_graph.cli.terminal import say, say_json
 from ssm_graph.io.file_kind import check_is_file
+from ssm_graph.report.clock import clocked
 from ssm_graph.report.terminal.progress import ProgressDisplay
 
 DESCRIPTION = """\
@@ -52,7 +53,7 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     check_is_file(arguments.path)
     with ProgressDisplay(errors) as show:
         show.stage(f"reading {arguments.path}")
-        found = inspect_path(arguments.path)
+        found = inspect_path(arguments.path, show.stage)
     if arguments.draft_map is not None:
         _draft(arguments.path, arguments.draft_map, errors)
     if arguments.json:
@@ -88,9 +89,13 @@ def _draft(path: Path, out: Path, errors: Console) -> None:
 def _tell(found: Any, console: Console) -> None:
     say(console, f"{found.path}: {found.kind}")
     if found.sensors:
+        begins_s = (one.timing.begin_s for one in found.sensors if one.timing.n)
+        begin_s = min(begins_s, default=0.0)
+        if UNIX_FROM_S <= begin_s <= UNIX_UNTIL_S:
+            day = datetime.fromtimestamp(begin_s, UTC)
+            say(console, f"  begins {day:%Y-%m-%d %H:%M:%S} UTC")
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
         table.add_column("sensor", style="bold")
-        begin_s = found.sensors[0].timing.begin_s
         clock = "UTC" if UNIX_FROM_S <= begin_s <= UNIX_UNTIL_S else "s"
         headings = ("rows", f"from, {clock}", f"to, {clock}", "rate, Hz", "jitter, ms", "gaps")
         for heading in (*headings, "in gaps, s"):
@@ -112,7 +117,8 @@ def _tell(found: Any, console: Console) -> None:
         for fact in one.facts:
             say(console, f"  {one.name}: {fact}")
         for odd in one.oddities:
-            console.print(Text(f"  {one.name}: {odd}", style="yellow"), soft_wrap=True)
+            text = clocked(odd, begin_s)
+            console.print(Text(f"  {one.name}: {text}", style="yellow"), soft_wrap=True)
     for note in found.notes:
         console.print(Text(f"note: {note}", style="yellow"), soft_wrap=True)
     for suspect in found.suspects:

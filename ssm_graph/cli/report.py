@@ -25,8 +25,8 @@ DESCRIPTION = """\
 Write one page about a result: the verdict in words first, the track with its uncertainty, height,
 altitude, speed and attitude with linked axes of time to zoom in, errors against a reference where
 there is one, weights and innovations of all beams and aids, their whiteness, calibration, faults,
-what was assumed, versions and settings. The file holds all it shows: it opens without a network, on
-a phone too, and prints. Needs the extra 'report'.
+data quality, what was assumed, versions and settings. The file holds all it shows: it opens without
+a network, on a phone too, and prints. Needs the extra 'report'.
 
 example:
   ssm-graph report RESULT --open
@@ -70,7 +70,7 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
         results = result.tables
         check_rows(results)
         show.stage("reading the mission")
-        altitude, of_errors, note = _of_mission(result)
+        altitude, of_errors, data, note = _of_mission(result)
         content = Content(
             trajectory=results.trajectory,
             beams=results.beams,
@@ -80,6 +80,7 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
             protection=read_protection(arguments.result),
             altitude=altitude,
             errors=of_errors,
+            data=data,
         )
         now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
         version = (results.summary.get("versions") or {}).get("ssm_graph")
@@ -93,14 +94,35 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     return True
 
 
-def _of_mission(result: Result) -> tuple[tuple[Array, Array] | None, ErrorSeries | None, str]:
-    """Return altitude, errors against the reference, and why there are none where that is so."""
+def _of_mission(
+    result: Result,
+) -> tuple[tuple[Array, Array] | None, ErrorSeries | None, list[tuple[str, ...]], str]:
+    """Return altitude, errors against the reference, data quality, and why there are none."""
     from ssm_graph.evaluation.errors import error_series
 
     try:
         altitude, reference = result.altitude, result.reference
-        if reference is None:
-            return altitude, None, ""
-        return altitude, error_series(result.estimate.trajectory, reference), ""
+        of_errors = None
+        if reference is not None:
+            of_errors = error_series(result.estimate.trajectory, reference)
+        return altitude, of_errors, _data(result), ""
     except SsmGraphError as error:
-        return None, None, f"a page without altitude and errors: {error}"
+        return None, None, [], f"a page without altitude, errors and data quality: {error}"
+
+
+def _data(result: Result) -> list[tuple[str, ...]]:
+    """Return rows of the page's table of the mission's sensors."""
+    from ssm_graph.inspection.sensors import sensors_of
+
+    return [
+        (
+            one.name,
+            f"{one.timing.n}",
+            f"{one.timing.rate_hz:.4g}",
+            f"{1e3 * one.timing.jitter_s:.2f}",
+            f"{one.timing.n_gaps}",
+            f"{one.timing.in_gaps_s:.1f}",
+            "; ".join((*one.facts, *(f"⚠ {odd}" for odd in one.oddities))),
+        )
+        for one in sensors_of(result.mission)
+    ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -13,15 +13,17 @@ import numpy as np
 
 from ssm_graph.base.errors import DataError, SsmGraphError
 from ssm_graph.base.frozen import Array
-from ssm_graph.inspection.sensors import SensorFound, sensors_of
+from ssm_graph.base.progress import told
+from ssm_graph.inspection.sensors import SensorFound, sensors_in, sensors_of
 from ssm_graph.inspection.timing import timing_of
 from ssm_graph.io.ardupilot.convert import convert_ardupilot, is_ardupilot
+from ssm_graph.io.ardupilot.dataflash import is_dataflash
 from ssm_graph.io.blueye.convert import convert_blueye
 from ssm_graph.io.columns.convert import times
-from ssm_graph.io.columns.draft import guess_time
+from ssm_graph.io.columns.draft import guess_sections, guess_time
 from ssm_graph.io.columns.map_file import Times
 from ssm_graph.io.columns.sources import ENDINGS, read_source
-from ssm_graph.io.file_kind import is_mcap, kind_of
+from ssm_graph.io.file_kind import first_bytes, is_mcap, kind_of
 from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.io.mission_folder.toml import TOML_NAME
 from ssm_graph.io.ros.convert import convert_rosbag
@@ -35,6 +37,10 @@ from ssm_graph.sensors.imu import ImuSample
 
 LEAST_S: Final = 30.0
 """Of a mission without a start: alignment needs about as much."""
+TABLE: Final = "table"
+"""What stands for the sensor that a table of unknown columns may be of."""
+MOST_FILES: Final = 30
+"""Of a folder, that are looked at one by one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,6 +59,11 @@ class Inspection:
     """What stands between this and a trajectory, with what to do; empty if it can be smoothed."""
     mission: Mission | None
     """Where it could be read as one."""
+
+    @property
+    def is_recording(self) -> bool:
+        """Whether it is the output of an instrument."""
+        return any(one.name != TABLE for one in self.sensors)
 
     @property
     def can_be_smoothed(self) -> bool:
@@ -111,10 +122,15 @@ def is_mission_folder(path: Path) -> bool:
     return (path / TOML_NAME).is_file() or path.name == TOML_NAME
 
 
-def inspect_path(path: Path) -> Inspection:
+def inspect_path(path: Path, stage: Callable[[str], None] | None = None) -> Inspection:
     """Look at a file, folder, bag or mission; what cannot be read is said, not raised.
 
     Raises :class:`DataError` only where there is nothing at the path.
+
+    Parameters
+    ----------
+    path : what to look at.
+    stage : is told what is done next, for a display.
     """
     if not path.exists():
         raise DataError(f"{path}: there is no such file or folder")
@@ -125,6 +141,8 @@ def inspect_path(path: Path) -> Inspection:
         mission = read(path)
     except SsmGraphError as error:
         return Inspection(path, kind, (), (), (), (str(error),), None)
+    if stage is not None:
+        stage("comparing clocks, units and axes")
     return inspect_mission(mission, path, kind)
 
 
@@ -133,11 +151,13 @@ def _reader(path: Path) -> tuple[str, Any]:
     if is_mission_folder(path):
         return "mission folder", lambda p: read_mission(p if p.is_dir() else p.parent)
     if is_rosbag(path):
-        return "ROS bag", convert_rosbag
+        number = 1 if first_bytes(path).startswith(b"#ROSBAG") else 2
+        return f"ROS {number} bag", convert_rosbag
     if path.is_file() and is_mcap(path):
         return "Blueye X3 log (MCAP)", convert_blueye
     if path.is_file() and is_ardupilot(path):
-        return "ArduPilot log", convert_ardupilot
+        kind = "dataflash" if is_dataflash(first_bytes(path)) else "telemetry"
+        return f"ArduPilot {kind} log", convert_ardupilot
     return "", None
 
 
@@ -187,29 +207,36 @@ def _missing(mission: Mission) -> Iterator[str]:
 def _without_mission(path: Path) -> Inspection:
     """Return what a file of one instrument, a table or an unknown file is."""
     if path.is_dir():
-        return Inspection(path, "folder", (), (), (), (kind_of(path),), None)
+        return _folder(path)
     try:
         recorded = read_recorded(path)
     except SsmGraphError as error:
-        return Inspection(path, "instrument's own output", (), (), (), (str(error),), None)
+        return Inspection(path, "a recording", (), (), (), (str(error),), None)
     if recorded is None:
         return _table(path) or Inspection(path, "file", (), (), (), (kind_of(path),), None)
-    times: dict[str, list[float]] = {}
-    for message in recorded.messages:
-        times.setdefault(type(message).__name__, []).append(message.time_s)
-    sensors = tuple(
-        SensorFound(name, timing_of(np.array(of)), (), (), np.array(of), {})
-        for name, of in times.items()
-    )
-    kind = "instrument's own output: "
-    kind += ", ".join(f"{one.timing.n} {one.name}" for one in sensors)
+    sensors = tuple(sensors_in(recorded.messages))
     missing = "it holds no inertial data; ssm-graph convert makes tables of it for a mission folder"
-    if {ImuSample.__name__, Ping.__name__} <= set(times):
+    if {ImuSample, Ping} <= {type(message) for message in recorded.messages}:
         missing = (
             "it says nothing of noise, mounting and place; ssm-graph convert with  --vehicle  "
             "makes a mission of it"
         )
-    return Inspection(path, kind, sensors, recorded.notes, (), (missing,), None)
+    return Inspection(path, recorded.about, sensors, recorded.notes, (), (missing,), None)
+
+
+def _folder(path: Path) -> Inspection:
+    """Return what lies in a folder that is neither mission nor bag, file by file."""
+    inside = sorted(one for one in path.iterdir() if one.is_file())
+    shown = inside[:MOST_FILES]
+    looks = [inspect_path(one) for one in told(shown, len(shown))]
+    notes = [f"{look.path.name}: {look.kind}" for look in looks]
+    if len(inside) > len(shown):
+        notes.append(f"{len(inside) - len(shown)} more files are not looked at")
+    kind = f"folder of {len(inside)} file{'s' * (len(inside) != 1)}"
+    missing = kind_of(path)
+    if any(look.mission is not None or look.is_recording for look in looks):
+        missing = "no mission: inspect and convert its files by name (ssm-graph convert --help)"
+    return Inspection(path, kind, (), tuple(notes), (), (missing,), None)
 
 
 def _table(path: Path) -> Inspection | None:
@@ -219,23 +246,28 @@ def _table(path: Path) -> Inspection | None:
     try:
         source = read_source(path)
     except SsmGraphError as error:
-        return Inspection(path, "table", (), (), (), (str(error),), None)
+        return Inspection(path, "text, or a damaged table", (), (), (), (str(error),), None)
     columns: dict[str, Array] = {}
     for name in source.columns:
         with contextlib.suppress(DataError):
             values = source.numbers(name, "inspect")
             if np.isfinite(values).any():
                 columns[name] = values
-    facts = tuple(
+    facts = [
         f"{name}: {np.nanmin(values):.6g} to {np.nanmax(values):.6g}"
         for name, values in columns.items()
-    )
+    ]
     known = np.zeros(0)
     with contextlib.suppress(SsmGraphError):  # no time, or no package that knows its unit
         guess = guess_time(source)
         time_s = times(Times("", guess.columns, (guess.unit,), 0.0), source)
         known = time_s[np.isfinite(time_s)]
-    found = SensorFound("table", timing_of(known), facts, (), known, {})
+        facts += [
+            f"may be {one.key} of [{section}]: {', '.join(one.columns)}, {one.unit} ({one.why})"
+            for section, guesses in guess_sections(source).items()
+            for one in guesses[1:]
+        ]
+    found = SensorFound(TABLE, timing_of(known), tuple(facts), (), known, {})
     missing = (
         "a table alone is no mission: --draft-map map.toml says what its columns may be, and "
         "ssm-graph convert --map makes a mission of it; or put it into a folder with a "

@@ -34,7 +34,8 @@ def save_picture(found: Inspection, path: Path) -> Path:
         :MOST_CURVES
     ]
     heights = [0.35 * len(sensors) + 0.5, *[_PANEL_HEIGHT] * len(curves)]
-    figure = style.new_figure(7.5, sum(heights) + 0.7, f"{found.path.name}: {found.kind}")
+    what = found.kind.partition(",")[0]
+    figure = style.new_figure(7.5, sum(heights) + 0.7, f"{found.path.name}: {what}")
     axes = np.atleast_1d(
         figure.subplots(len(heights), 1, sharex=True, gridspec_kw={"height_ratios": heights})
     )
@@ -54,6 +55,9 @@ def save_picture(found: Inspection, path: Path) -> Path:
         since = (one.time_s[kept] - begin) / divisor
         place.plot(since, values[kept], ".", markersize=1.5, color=style.ESTIMATE)
         style.dress(place, title=f"{one.name}: {name}")
+        if np.all(values[kept] % 1.0 == 0.0):  # a count
+            place.set_ylim(-0.2, values.max() + 0.4)
+            place.yaxis.get_major_locator().set_params(integer=True)
     axes[-1].set_xlabel(label, fontsize=style.SMALL + 0.5, color=style.INK)
     return style.save(figure, path)
 

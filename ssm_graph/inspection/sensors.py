@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ssm_graph.base.earth import normal_gravity
+from ssm_graph.base.earth import LocalFrame, normal_gravity
 from ssm_graph.base.frozen import Array
 from ssm_graph.inspection.timing import Timing, timing_of
 from ssm_graph.mission.mission import Mission
@@ -20,6 +21,9 @@ from ssm_graph.sensors.dvl import DvlLog
 from ssm_graph.sensors.frozen import frozen_runs
 from ssm_graph.sensors.gnss import GnssLog
 from ssm_graph.sensors.imu import ImuLog, frozen_axes
+from ssm_graph.sensors.messages import Message, field_names
+from ssm_graph.sensors.place import PositionMessage
+from ssm_graph.sensors.registry import INSTRUMENTS
 
 Curves = dict[str, Array]
 """Values (N,) by name with its unit, for the picture."""
@@ -42,16 +46,39 @@ class SensorFound:
 def sensors_of(mission: Mission) -> Iterator[SensorFound]:
     """Yield what every sensor of a mission says."""
     for kind, log in mission.logs.items():
-        if not hasattr(log, "time_s"):
-            continue
-        time_s = np.asarray(log.time_s)
-        look = _LOOKS.get(kind, _plain) if len(time_s) else _nothing
-        facts, oddities, curves = look(log, mission)
-        timing = timing_of(time_s)
-        name = _NAMES.get(kind, kind.__name__.removesuffix("Log"))
-        yield SensorFound(
-            name, timing, facts, (*oddities, *_of_timing(timing)), time_s, dict(curves)
-        )
+        if hasattr(log, "time_s"):
+            yield _found(kind, log, mission.frame)
+
+
+def sensors_in(messages: Sequence[Message]) -> Iterator[SensorFound]:
+    """Yield what every sensor of a recording says, which has no mission around it."""
+    of: dict[type[Message], list[Message]] = {}
+    for message in messages:
+        of.setdefault(type(message), []).append(message)
+    first = next((one for one in messages if isinstance(one, PositionMessage)), None)
+    place = (0.25 * np.pi, 0.0, 0.0) if first is None else (first.lat, first.lon, first.height)
+    for instrument in INSTRUMENTS:
+        if instrument.message in of:
+            yield _found(instrument.log, _rows(of[instrument.message]), LocalFrame(*place))
+
+
+def _rows(messages: Sequence[Message]) -> SimpleNamespace:
+    """Return the readings of one instrument by the names that its log has for them too."""
+    fields = {
+        name: [getattr(message, name) for message in messages]
+        for name in field_names(type(messages[0]))
+    }
+    whole = {name: of for name, of in fields.items() if all(one is not None for one in of)}
+    return SimpleNamespace(**{name: np.array(of) for name, of in whole.items()})
+
+
+def _found(kind: type, log: Any, frame: LocalFrame) -> SensorFound:
+    time_s = np.asarray(log.time_s)
+    look = _LOOKS.get(kind, _plain) if len(time_s) else _nothing
+    facts, oddities, curves = look(log, frame)
+    timing = timing_of(time_s)
+    name = _NAMES.get(kind, kind.__name__.removesuffix("Log"))
+    return SensorFound(name, timing, facts, (*oddities, *_of_timing(timing)), time_s, dict(curves))
 
 
 Found = tuple[tuple[str, ...], tuple[str, ...], Curves]
@@ -69,10 +96,10 @@ def _of_timing(timing: Timing) -> Iterator[str]:
         yield f"{timing.n_repeats} times stand twice, {timing.n_back} go back"
 
 
-def _imu(log: ImuLog, mission: Mission) -> Found:
+def _imu(log: Any, frame: LocalFrame) -> Found:
     force = np.linalg.norm(log.accel_b, axis=1)
     rate = np.degrees(np.linalg.norm(log.gyro_b, axis=1))
-    gravity = float(normal_gravity(mission.frame.lat, mission.frame.height))
+    gravity = float(normal_gravity(frame.lat, frame.height))
     mean_b = log.accel_b.mean(axis=0)
     down = "xyz"[int(np.argmax(np.abs(mean_b)))]
     facts = (
@@ -92,73 +119,79 @@ def _imu(log: ImuLog, mission: Mission) -> Found:
     return facts, tuple(oddities), {"specific force, m/s²": force, "turn rate, deg/s": rate}
 
 
-def _dvl(log: DvlLog, _: Mission) -> Found:
+def _dvl(log: Any, _: LocalFrame) -> Found:
     known: NDArray[np.bool_] = np.isfinite(log.speed)
     counts = known.sum(axis=1)
-    n_beams = log.mount.n_beams
+    n_beams = known.shape[1]
     every = 100.0 * np.mean(counts == n_beams)
     shares = ", ".join(f"{100.0 * column.mean():.0f}" for column in known.T)
     facts = [
         f"{n_beams} beams, speeds known in {shares} % of the pings, all of them in {every:.0f} %",
         f"beam speeds up to {np.nanmax(np.abs(log.speed)):.2f} m/s" if known.any() else "no speed",
-        f"stated noise {1e3 * np.nanmedian(log.sigma):.1f} mm/s in the median",
     ]
+    sigma = getattr(log, "sigma", np.nan)
+    if np.isfinite(sigma).any():
+        facts.append(f"stated noise {1e3 * np.nanmedian(sigma):.1f} mm/s in the median")
     if log.is_water.any():
         facts.append(f"{100.0 * log.is_water.mean():.0f} % of the pings are off the water")
     curves: Curves = {"beams with a speed": counts.astype(float)}
-    if log.range_m is not None and np.isfinite(log.range_m).any():
-        shortest = np.min(np.where(np.isfinite(log.range_m), log.range_m, np.inf), axis=1)
-        facts.append(f"ranges {np.nanmin(log.range_m):.1f} to {np.nanmax(log.range_m):.1f} m")
+    range_m = getattr(log, "range_m", None)
+    if range_m is not None and np.isfinite(range_m).any():
+        shortest = np.min(np.where(np.isfinite(range_m), range_m, np.inf), axis=1)
+        facts.append(f"ranges {np.nanmin(range_m):.1f} to {np.nanmax(range_m):.1f} m")
         curves["shortest range, m"] = np.where(np.isfinite(shortest), shortest, np.nan)
     fastest = np.nanmax(np.abs(np.where(known, log.speed, 0.0)), axis=1)
     return tuple(facts), (), {"fastest beam, m/s": fastest, **curves}
 
 
-def _depth(log: DepthLog, _: Mission) -> Found:
+def _depth(log: Any, _: LocalFrame) -> Found:
     runs = frozen_runs(log.time_s, log.depth[:, None], least_s=10.0, least_count=10)
     oddities = [
         f"repeats {log.depth[begin]:.3f} m from {log.time_s[begin]:.1f} to {log.time_s[end]:.1f} s"
         for begin, end in runs[:3]
     ]
-    facts = (f"{log.depth.min():.2f} to {log.depth.max():.2f} m",)
+    facts = (f"{log.depth.min():z.2f} to {log.depth.max():z.2f} m",)
     return facts, tuple(oddities), {"depth, m": log.depth}
 
 
-def _gnss(log: GnssLog, mission: Mission) -> Found:
-    enu = mission.frame.p_n_from_geodetic(log.lat, log.lon, log.height)
+def _gnss(log: Any, frame: LocalFrame) -> Found:
+    enu = frame.p_n_from_geodetic(log.lat, log.lon, log.height)
     extent = np.ptp(enu, axis=0)
     sigma = np.median(np.asarray(log.sigma_enu), axis=0)
     facts = (
         f"within {extent[0]:.0f} m east and {extent[1]:.0f} m north, heights "
-        f"{log.height.min():.1f} to {log.height.max():.1f} m",
+        f"{log.height.min():z.1f} to {log.height.max():z.1f} m",
         f"stated sigma {sigma[0]:.2f}, {sigma[1]:.2f}, {sigma[2]:.2f} m east, north, up",
     )
     off = np.hypot(enu[:, 0] - enu[0, 0], enu[:, 1] - enu[0, 1])
     return facts, (), {"from the first fix, m": off}
 
 
-def _heading(log: HeadingLog, _: Mission) -> Found:
-    degrees = np.degrees(log.heading) % 360.0
-    return (f"stated sigma {np.degrees(log.sigma):.2f} deg",), (), {"heading, deg": degrees}
+def _heading(log: Any, _: LocalFrame) -> Found:
+    turned = np.degrees(np.abs(np.diff(np.unwrap(log.heading))).sum())
+    facts = [f"turns by {turned:.0f} deg in all"]
+    if hasattr(log, "sigma"):
+        facts.append(f"stated sigma {np.degrees(log.sigma):.2f} deg")
+    return tuple(facts), (), {"heading, deg": np.degrees(log.heading) % 360.0}
 
 
-def _usbl(log: UsblLog, _: Mission) -> Found:
+def _usbl(log: Any, _: LocalFrame) -> Found:
     return (f"{len(log.time_s)} acoustic fixes",), (), {}
 
 
-def _ranges(log: RangeLog, _: Mission) -> Found:
+def _ranges(log: Any, _: LocalFrame) -> Found:
     return (f"ranges to {len(np.unique(log.beacon))} beacons",), (), {"range, m": log.range_m}
 
 
-def _nothing(_log: Any, _: Mission) -> Found:
+def _nothing(_log: Any, _: LocalFrame) -> Found:
     return ("no rows",), (), {}
 
 
-def _plain(_log: Any, _: Mission) -> Found:
+def _plain(_log: Any, _: LocalFrame) -> Found:
     return (), (), {}
 
 
-_LOOKS: Final[dict[type, Callable[[Any, Mission], Found]]] = {
+_LOOKS: Final[dict[type, Callable[[Any, LocalFrame], Found]]] = {
     ImuLog: _imu,
     DvlLog: _dvl,
     DepthLog: _depth,

@@ -14,6 +14,8 @@ READ: Final = (
     "reports, NMEA 0183, or tables with  --map"
 )
 _MCAP: Final = b"\x89MCAP0\r\n"
+_REMARKS: Final = 4096
+"""Bytes in which remarks before the content end."""
 _COMPRESSED: Final = "a compressed file: unpack it first"
 _KINDS: Final = (
     (b"#ROSBAG V1", "a ROS 1 bag of version 1: bring it to 2.0 with  rosbag fix"),
@@ -26,10 +28,17 @@ _KINDS: Final = (
     (b"ULog\x01\x12\x35", "a PX4 ULog: export its tables with  ulog2csv"),
     (b"\x7f\x7f", "like Teledyne PD0, but its first ensemble is damaged"),
     (b"\xb5\x62", "binary of a u-blox receiver: have it write NMEA, or convert it"),
+    (b"\xa0\xa2", "binary of a SiRF receiver: have it write NMEA, or convert it"),
+    (b"\xd3\x00", "RTCM 3, corrections of a receiver: have it write NMEA beside them"),
     (b"SQLite format 3\0", "an SQLite database: a ROS 2 bag has it under the name .db3"),
     (b"PAR1", "a Parquet table: say what its columns are, with  --map"),
     (b"\x89HDF\r\n", "an HDF5 file: say what its columns are, with  --map"),
     (b"MATLAB", "a MAT file: say what its columns are, with  --map"),
+    (b"CDF", "a classic NetCDF file: bring it to NetCDF 4 with  nccopy -k nc4, then  --map"),
+    (b"\x89PNG", "an image"),
+    (b"\xff\xd8\xff", "an image"),
+    (b"%PDF", "a PDF"),
+    (b"<?xml", "XML"),
 )
 
 
@@ -41,7 +50,7 @@ def check_is_file(path: Path) -> None:
 
 def is_mcap(path: Path) -> bool:
     """Return whether a file begins as MCAP does."""
-    return _head(path).startswith(_MCAP)
+    return first_bytes(path).startswith(_MCAP)
 
 
 def kind_of(path: Path) -> str:
@@ -50,12 +59,13 @@ def kind_of(path: Path) -> str:
         n_tables = sum(one.suffix.lower() in CSV_ENDINGS for one in path.iterdir())
         if n_tables:
             return (
-                f"a folder of {n_tables} tables: say what their columns are, with  --map  "
+                f"a folder with {n_tables} table{'s' * (n_tables > 1)}: say what the columns are, "
+                "with  --map  "
                 f"(ssm-graph template, ssm-graph inspect {path} --draft-map map.toml); else "
                 f"expected {READ}"
             )
         return f"a folder without .mcap or .db3 files; expected {READ}"
-    head = _head(path)
+    head = _after_remarks(path)
     if not head:
         return f"empty, or it cannot be read; expected {READ}"
     for begin, what in _KINDS:
@@ -73,12 +83,28 @@ def kind_of(path: Path) -> str:
     return f"of no known kind, it begins with {head[:12]!r}; expected {READ}"
 
 
+def _after_remarks(path: Path) -> bytes:
+    """Return what stands in a file behind the remarks that somebody put before it."""
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(_REMARKS)
+    except OSError:
+        return b""
+    rest = head
+    while (
+        rest.startswith((b"#", b"\n", b"\r")) and not rest.startswith(b"#ROSBAG") and b"\n" in rest
+    ):
+        rest = rest.partition(b"\n")[2]
+    return rest or head
+
+
 def _is_mavlink(head: bytes) -> bool:
     """Return whether frames stand alone."""
     return head[:1] in (b"\xfd", b"\xfe")
 
 
-def _head(path: Path) -> bytes:
+def first_bytes(path: Path) -> bytes:
+    """Return what a file begins with, nothing of one that cannot be read."""
     try:
         with path.open("rb") as stream:
             return stream.read(32)

@@ -10,7 +10,8 @@ from ssm_graph.base.times import UNIX_FROM_S, UNIX_UNTIL_S
 
 _TIME: Final = r"(\d+(?:\.\d+)?)"
 _WHEN: Final = re.compile(
-    rf"\b(?:at|from|since) {_TIME} s\b(?: to {_TIME} s\b)?|(?<=, ){_TIME}-{_TIME} s(?=,)"
+    rf"\b(?:at|from|since) {_TIME} s\b(?: to {_TIME} s\b)?|\bfrom {_TIME} to {_TIME} s\b"
+    rf"|(?<=, ){_TIME}-{_TIME} s(?=,)"
 )
 """One time, or two of a stretch, as notes and reasons write them."""
 

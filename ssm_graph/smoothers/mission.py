@@ -98,6 +98,8 @@ def smooth(
     :class:`SolverError`.
     """
     require_usable(mission)
+    if on_stage is not None:
+        on_stage("comparing clocks, units and axes")
     suspects = find_suspects(mission)
     steps = smooth_steps(
         mission,

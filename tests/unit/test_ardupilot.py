@@ -16,6 +16,7 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.cli.main import main
 from ssm_graph.io.ardupilot.convert import convert_ardupilot, is_ardupilot
 from ssm_graph.io.ardupilot.dataflash import read_dataflash
+from ssm_graph.io.ardupilot.telemetry import read_telemetry
 from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.io.mission_folder.vehicle import vehicle_of, write_vehicle
 from ssm_graph.mission.mission import Mission
@@ -225,6 +226,31 @@ def test_a_telemetry_log_by_the_makers_library(mission: Mission, tmp_path: Path)
     np.testing.assert_allclose(found.imu.accel_b, mission.imu.accel_b[::5], atol=2e-6)
     np.testing.assert_allclose(found.dvl.speed, velocities(mission)[1], atol=1e-6)
     assert any("bytes of no sound record" in note for note in found.notes)
+
+
+def test_damage_of_telemetry_costs_the_damaged_frames_alone(mission: Mission) -> None:
+    """Frames have a checksum: cut at every length or with bytes changed, what is left is sound."""
+    pytest.importorskip("pymavlink")
+    data = tlog(mission)
+    first = 20 + data[9]  # eight bytes of time, twelve around a frame
+    ends = [first, first + 20 + data[first + 9]]
+    whole, _ = read_telemetry(data)
+    for end in range(ends[1] + 1):
+        found, n_skipped = read_telemetry(data[:end])
+        n_rows = sum(len(columns["TimeUS"]) for columns in found.values())
+        assert n_rows == sum(end >= of for of in ends)
+        assert n_skipped == end - max([0, *(of for of in ends if of <= end)])
+    rng = np.random.default_rng(6)
+    for _ in range(10):
+        broken = bytearray(data)
+        for at in rng.integers(len(broken), size=40):
+            broken[at] ^= 1 + int(rng.integers(255))
+        found, n_skipped = read_telemetry(bytes(broken))
+        assert n_skipped > 0
+        readings = np.stack([found["IMU"][name] for name in ("GyrX", "AccZ")], axis=1)
+        known = np.stack([whole["IMU"][name] for name in ("GyrX", "AccZ")], axis=1)
+        assert len(known) - 40 <= len(readings) < len(known)
+        assert {tuple(row) for row in readings} <= {tuple(row) for row in known}
 
 
 def test_other_bytes_are_none(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from scipy.io import savemat
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.cli.main import main
+from ssm_graph.inspection.look import inspect_path
 from ssm_graph.io.columns.convert import convert_columns, times
 from ssm_graph.io.columns.draft import draft_map
 from ssm_graph.io.columns.map_file import ColumnMap, Times, read_map
@@ -480,6 +481,31 @@ def test_times_in_several_columns_are_drafted(tmp_path: Path) -> None:
         units = tuple(of.get("units") or [of["unit"]])
         wanted = Times("map.toml [depth] time", names, units, float(of.get("offset_s", 0.0)))
         np.testing.assert_allclose(times(wanted, read_source(path)), at, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("speeds", "ranges", "others"),
+    [
+        ("field.bottomVelocityBeam{}", "field.altitudeBeam{}", "field.waterVelocityBeam{}"),
+        ("beam{}_velocity", "beam{}_distance", "beam{}_valid"),
+        ("bt_vel_{}", "bt_range_{}", "wt_vel_{}"),
+    ],
+)
+def test_a_draft_takes_the_speeds_off_the_ground(
+    tmp_path: Path, speeds: str, ranges: str, others: str
+) -> None:
+    """Not those off the water, nor flags, ranges and a code that never changes."""
+    k = np.arange(6.0)
+    columns: dict[str, Any] = {"time": 0.25 * k, "heading": 0.0 * k, "pressure": 0.0 * k + 101.0}
+    for form, size in ((others, 0.1), (ranges, 9.0), (speeds, 0.3)):
+        columns |= {form.format(beam): size + 0.01 * k for beam in range(4)}
+    _csv(tmp_path / "a.csv", columns)
+    drafted = tomllib.loads(draft_map(read_source(tmp_path / "a.csv")).text)
+    assert drafted["dvl"]["beam"]["columns"] == [speeds.format(beam) for beam in range(4)]
+    assert drafted["dvl"]["range"]["columns"] == [ranges.format(beam) for beam in range(4)]
+    assert not {"depth", "heading"} & set(drafted)
+    said = " ".join(inspect_path(tmp_path / "a.csv").sensors[0].facts)
+    assert f"may be beam of [dvl]: {speeds.format(0)}" in said
 
 
 def test_tables_of_other_loggers(tmp_path: Path) -> None:

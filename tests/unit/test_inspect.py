@@ -19,6 +19,7 @@ from ssm_graph.inspection.look import inspect_mission, inspect_path
 from ssm_graph.inspection.picture import save_picture
 from ssm_graph.inspection.timing import timing_of
 from ssm_graph.io.mission_folder.folder import write_mission
+from ssm_graph.io.nmea_sentences import checksum
 from ssm_graph.mission.mission import Mission
 from ssm_graph.sensors.gnss import GnssLog
 from ssm_graph.simulation import scenario_config, simulate
@@ -115,6 +116,28 @@ def test_gaps_and_frozen_readings_are_odd(mission: Mission) -> None:
     found = {one.name: one for one in inspect_mission(changed, Path("m")).sensors}
     assert found["depth"].oddities[0].startswith("repeats 3.250 m from 60.5 to 90.0 s")
     assert "the longest 7.00 s from 3.0 s on" in found["GNSS"].oddities[0]
+
+
+def test_a_recording_says_what_it_reads(tmp_path: Path) -> None:
+    """Its format in the first line, sensors by their names; of a folder each file."""
+    bodies = ["GPRMC,100000,A,4500.000,N,00700.000,E,0,0,010526,,"]
+    for k in range(9):
+        bodies += [f"GPGGA,1000{k:02d},4500.{k:03d},N,00700.000,E,1,08,1.0,5,M,0,M,,"]
+        bodies += [f"HEHDT,{10 * k}.0,T"]
+    text = "".join(f"${body}*{checksum(body)}\r\n" for body in bodies)
+    (tmp_path / "gps.log").write_text(text)
+    (tmp_path / "photo.png").write_bytes(b"\x89PNG" + bytes(40))
+    found = inspect_path(tmp_path / "gps.log")
+    assert found.kind == "NMEA 0183, 9 positions, 9 headings"
+    names = {one.name: one for one in found.sensors}
+    assert names["GNSS"].facts[0].startswith("within 0 m east and 15 m north")
+    assert names["compass"].facts == ("turns by 80 deg in all",)
+    assert names["GNSS"].curves
+    folder = inspect_path(tmp_path)
+    assert folder.kind == "folder of 2 files"
+    assert folder.notes[0] == f"gps.log: {found.kind}"
+    assert "convert its files by name" in folder.verdict
+    assert "an image" in inspect_path(tmp_path / "photo.png").verdict
 
 
 def test_other_files_are_named_by_their_content(

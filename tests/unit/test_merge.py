@@ -15,8 +15,10 @@ from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.cli.main import ExitCode, main
 from ssm_graph.io.mission_folder.folder import read_mission, write_mission
 from ssm_graph.io.mission_folder.vehicle import read_vehicle
+from ssm_graph.io.raw_log.log import RawLog
 from ssm_graph.live.recorded.merge import merge_recordings
 from ssm_graph.live.recorded.turns import clock_offset
+from ssm_graph.sensors.messages import Message
 from ssm_graph.simulation import CALM, SimulatedMission, SurveyRoute
 from tests.helpers import simulated
 
@@ -81,6 +83,52 @@ def test_the_mission_is_the_one_that_both_are_of(folder: Path, tmp_path: Path) -
     stated = merge_recordings(logs, tmp_path / "by", vehicle=vehicle, offset_s=-AHEAD_S)
     off_s = stated.mission.dvl.time_s - mission.dvl.time_s
     np.testing.assert_allclose(off_s, 0.0, atol=1e-5)
+
+
+def test_an_interrupted_merge_leaves_nothing(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A mission that lacks its end would look like a whole one."""
+    append, n_rows = RawLog.append, 0
+
+    def stop(self: RawLog, message: Message) -> None:
+        nonlocal n_rows
+        n_rows += 1
+        if n_rows > 50:
+            raise KeyboardInterrupt
+        append(self, message)
+
+    monkeypatch.setattr(RawLog, "append", stop)
+    logs = [folder / "dvl.json", folder / "mission" / "imu.csv"]
+    with pytest.raises(KeyboardInterrupt):
+        merge_recordings(logs, tmp_path / "out", vehicle=read_vehicle(folder / "mission"))
+    assert not [*tmp_path.iterdir()]
+
+
+def test_tables_of_any_columns_join_a_recording(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A map without a DVL, whose recording lies beside the tables; without one it is refused."""
+    imu = sim().mission.imu
+    flu = np.array([1.0, -1.0, -1.0])
+    rows = np.column_stack([1e3 * imu.time_s, np.degrees(imu.gyro_b) * flu, imu.accel_b * flu])
+    head = "t_ms,wx,wy,wz,ax,ay,az"
+    np.savetxt(tmp_path / "own.csv", rows, "%.12g", ",", header=head, comments="")
+    (tmp_path / "map.toml").write_text(
+        'format = 1\n[imu]\ntime = { column = "t_ms", unit = "ms" }\n'
+        'gyro = { columns = ["wx", "wy", "wz"], unit = "deg/s", axes = "FLU" }\n'
+        'accel = { columns = ["ax", "ay", "az"], axes = "FLU" }\n'
+    )
+    words = ["convert", "--map", str(tmp_path / "map.toml"), "--vehicle", str(folder / "mission")]
+    words += ["--out", str(tmp_path / "out"), str(tmp_path / "own.csv")]
+    assert main(words) == 2
+    assert "or the recording of a DVL beside the tables" in capsys.readouterr().err
+    assert main([*words, str(folder / "dvl.json")]) == 0
+    assert "onto the clock of the IMU" in capsys.readouterr().out
+    found = read_mission(tmp_path / "out")
+    np.testing.assert_allclose(found.imu.gyro_b, imu.gyro_b, atol=1e-9)
+    np.testing.assert_array_equal(found.dvl.speed, sim().mission.dvl.speed)
+    assert np.abs(found.dvl.time_s - sim().mission.dvl.time_s).max() < 0.02
 
 
 def test_offset_and_its_sigma() -> None:

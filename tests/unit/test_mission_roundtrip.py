@@ -214,6 +214,7 @@ def test_interrupted_write_keeps_the_old_mission(
     assert_same(read_mission(tmp_path), make_mission())
     with pytest.raises(KeyboardInterrupt):
         write_mission(tmp_path / "new", shorter)
+    assert not [*(tmp_path / "new").iterdir()]
     with pytest.raises(ConfigError, match="there is none in"):
         read_mission(tmp_path / "new")
 

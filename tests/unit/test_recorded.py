@@ -63,6 +63,15 @@ def nmea(*bodies: str) -> bytes:
     return "".join(f"${body}*{checksum(body)}\r\n" for body in bodies).encode()
 
 
+def test_pings_of_another_number_of_beams_are_left_out(tmp_path: Path) -> None:
+    """One table has one number of columns."""
+    three = [{**one, "transducers": one["transducers"][:3]} for one in reports(9, "json_v3")[6:]]
+    lines = [json.dumps(one) for one in [*reports(6, "json_v3"), *three]]
+    found = read(tmp_path / "dvl.json", "\n".join(lines).encode())
+    assert {len(one.speed) for one in found.messages if isinstance(one, Ping)} == {4}
+    assert "6 pings are of 4 beams; 3 of 3 were left out: of another instrument?" in found.notes
+
+
 def test_reports_without_a_clock_are_timed_by_their_sum(tmp_path: Path) -> None:
     """Format json_v1: repeats add nothing, and the note says what the times are."""
     lines = [json.dumps(one) for one in reports(5)]
@@ -70,6 +79,13 @@ def test_reports_without_a_clock_are_timed_by_their_sum(tmp_path: Path) -> None:
     found = read(tmp_path / "dvl.txt", "\n".join(lines).encode())
     times = [one.time_s for one in found.messages]
     np.testing.assert_allclose(times, np.cumsum([0.100, 0.101, 0.102, 0.103, 0.104]))
+    assert found.about == "Water Linked JSON, 5 pings"
+    reckoned = {"type": "position_local", "ts": DAY_S + 0.35, "x": 0.0, "y": 0.0, "z": 0.0}
+    lines.insert(4, json.dumps({**reckoned, "std": 0.0, "roll": 0, "pitch": 0, "yaw": 0}))
+    stamped = read(tmp_path / "dvl.txt", "\n".join(lines).encode())
+    own = [one.time_s for one in stamped.messages if isinstance(one, Ping)]
+    np.testing.assert_allclose(np.diff(own), np.diff(times), atol=1e-6)  # one clock for all
+    assert own[0] > DAY_S
     assert "1 reports came again" in found.notes[0]
     assert "no clock" in found.notes[1]
 

@@ -111,13 +111,19 @@ def test_the_verdict_comes_first_and_in_words() -> None:
     text = verdict(content())
     assert text.index("SUSPECT") < text.index("Look first") < text.index("GNSS, 100-160 s")
     assert "40 of 2400 (1.7 %)" in text
-    assert f"{2.4477 * 0.799:.2f} m" in text
+    assert f"{1.96 * np.hypot(0.799, 0.799):.2f} m" in text
     told = dict(sections(content()))
     assert "1.7 to 2.6" in told["Sensors that were off"]
     assert "<td>5 to 6</td><td>40 of 240</td><td>2</td>" in told["Beams"]
+    assert "Data quality" not in told
+    rows = [("IMU", "60", "100", "0.10", "1", "3.0", "9.8 m/s²; 1 gap from 1060.0 s on")]
+    quality = dict(sections(content(data=rows)))["Data quality"]
+    assert "<td>3.0</td></tr>" in quality
+    assert "<li>IMU: 9.8 m/s²; 1 gap from 1060.0 s (1.0 min) on</li>" in quality
     survey = told["Position uncertainty for surveys"]
-    # 1 m over 2.4477 is a sigma of 0.4085 m, which 209 of 600 rows stay below.
-    assert "<td>Exclusive</td><td>1</td><td>34.8</td>" in survey
+    # 1 m over 1.96 and the root of 2 is a sigma of 0.3608 m, which 161 of 600 rows stay below.
+    assert "<td>Exclusive</td><td>1</td><td>26.8</td>" in survey
+    assert "<td>0.0 to 10.0</td></tr><tr><td>Special" in survey  # its height never meets it
 
 
 def test_charts_show_the_tables() -> None:

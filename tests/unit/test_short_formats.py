@@ -43,7 +43,7 @@ def test_beams_of_pd4_and_pd5(tmp_path: Path) -> None:
     assert is_pd45(path.read_bytes())
     found = read_recorded(path)
     assert found is not None
-    assert found.notes[0] == "Teledyne PD4, 3 ensembles, beam coordinates, bottom track in 100 %"
+    assert found.about == "Teledyne PD4, 3 ensembles, beam coordinates, bottom track in 100 %"
     ping = found.messages[1]
     assert isinstance(ping, Ping)
     np.testing.assert_array_equal(ping.speed, [0.1, -0.2, 0.3, np.nan])

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -46,21 +46,51 @@ from ssm_graph.sensors.registry import BY_LOG, BY_SECTION
 _OF_DAY: Final = re.compile(r"([01]?\d|2[0-3]):([0-5]\d):((?:[0-5]\d|60)(?:[.,]\d*)?)")
 
 
+class MappedLogs(NamedTuple):
+    """What the columns of some files hold."""
+
+    logs: tuple[Any, ...]
+    labels: dict[str, str | TableFile]
+    """Where the rows of each section stand."""
+    notes: tuple[str, ...]
+    """What was left out."""
+
+
 def convert_columns(
     files: Sequence[Path], column_map: ColumnMap, vehicle: Vehicle, *, name: str
 ) -> Mission:
     """Return the mission that columns of some files hold.
 
+    Raises :class:`ConfigError` for a map without a DVL, and for all that :func:`logs_of_columns`
+    refuses. Raises :class:`DataError` for all that a mission folder is refused for.
+
+    Parameters
+    ----------
+    files, column_map, vehicle : as of :func:`logs_of_columns`.
+    name : of the mission.
+    """
+    if "dvl" not in {section.name for section in column_map.sections}:
+        raise ConfigError(
+            f"{column_map.path.name} [dvl]: the section is missing; a mission needs it, or the "
+            "recording of a DVL beside the tables"
+        )
+    found = logs_of_columns(files, column_map, vehicle)
+    labels, notes = found.labels, list(found.notes)
+    return mission_from(found.logs, vehicle, source=Path(name), labels=labels, notes=notes)
+
+
+def logs_of_columns(files: Sequence[Path], column_map: ColumnMap, vehicle: Vehicle) -> MappedLogs:
+    """Return the logs that columns of some files hold, by the sections of a map.
+
     Raises :class:`ConfigError` for a map that does not fit the files or the vehicle, a unit that
     measures something else. Raises :class:`DataError` for a cell that is no number, with file, line
-    and column, and for all that a mission folder is refused for.
+    and column.
 
     Parameters
     ----------
     files : tables that end in .csv, .txt, .tsv, .dat, .parquet, .mat, .h5 or .hdf5.
     column_map : what their columns are.
     vehicle : noise, geometry and place; it has a section for each instrument of the map.
-    name : of the mission.
     """
     sources: dict[Path, Source] = {}
     bare = {BY_LOG[kind].section: log for kind, log in vehicle.bare_logs.items()}
@@ -81,7 +111,7 @@ def convert_columns(
         logs.append(log)
         labels[section.name] = file
         notes += said
-    return mission_from(logs, vehicle, source=Path(name), labels=labels, notes=notes)
+    return MappedLogs(tuple(logs), labels, tuple(notes))
 
 
 def _log(

@@ -34,8 +34,14 @@ _VECTORS: Final = {
 _BEAM: Final = re.compile(
     r"(?:^|.*_)(?:b|v|beam|bm|vel_beam|beam_vel|transducers?|vel)_?(\d)(?:_.*)?"
 )
+_NO_SPEED: Final = re.compile(
+    r"valid|good|credit|status|flag|_id$|rssi|_nsd|corr|(^|_)amp|noise|sigma|fom|dist|range|alt|time"
+)
+"""Numbers of a beam that are none of its speed."""
+_OFF_WATER: Final = re.compile(r"water|(?:^|_)wt(?:_|$)")
 _RANGE: Final = re.compile(
     r"(?:^|.*_)(?:r|range|rng|dist|distance|alt|altitude)_?(?:beam_?)?(\d).*"
+    r"|(?:^|.*_)(?:b|beam|bm|transducers?)_?(\d)_(?:r|range|rng|dist|distance|alt|altitude)(?:_.*)?"
 )
 _SCALARS: Final = {
     "depth": r"(^|_)depth($|_)",
@@ -98,7 +104,7 @@ def draft_map(*sources: Source) -> Drafted:
     """
     found: dict[str, tuple[Source, list[Guess]]] = {}
     for source in sources:
-        for name, guesses in _sections(source).items():
+        for name, guesses in guess_sections(source).items():
             found.setdefault(name, (source, guesses))
     if not found:
         for source in sources:
@@ -144,8 +150,8 @@ def _left_over(
             yield f"# not drafted, of {source.label}: {', '.join(left[:_MOST_NAMED])}{more}"
 
 
-def _sections(source: Source) -> dict[str, list[Guess]]:
-    """Return what a file may hold, each with its time."""
+def guess_sections(source: Source) -> dict[str, list[Guess]]:
+    """Return what a file may hold by section, of each its time first."""
     plain = {_plain(name): name for name in source.columns}
     place = _scalars(source, plain, ("lat", "lon", "height"))
     found = {
@@ -340,7 +346,9 @@ def _accel(names: tuple[str, ...], named: str, values: NDArray[np.float64], size
 
 
 def _dvl(source: Source, plain: dict[str, str]) -> list[Guess]:
-    beams = _numbered(plain, _BEAM)
+    speeds = {short: name for short, name in plain.items() if not _NO_SPEED.search(short)}
+    ground = {short: name for short, name in speeds.items() if not _OFF_WATER.search(short)}
+    beams = _numbered(ground, _BEAM) or _numbered(speeds, _BEAM)
     if len(beams) >= 3:
         short = next(short for short, name in plain.items() if name == beams[0])
         named = _named_unit(short)
@@ -372,11 +380,19 @@ def _code(values: NDArray[np.float64]) -> float | None:
 
 
 def _numbered(plain: dict[str, str], pattern: re.Pattern[str]) -> tuple[str, ...]:
-    found = {m[1]: name for short, name in plain.items() if (m := pattern.fullmatch(short))}
-    digits = sorted(found)
-    first = int(digits[0]) if digits else 0
-    is_run = digits == [str(first + i) for i in range(len(digits))]
-    return tuple(found[d] for d in digits) if is_run else ()
+    """Return columns whose names differ by a number alone that counts from 0 or 1."""
+    alike: dict[tuple[str, str], dict[int, str]] = {}
+    for short, name in plain.items():
+        found = pattern.fullmatch(short)
+        if found:
+            digit = found.lastindex or 0
+            ends = short[: found.start(digit)], short[found.end(digit) :]
+            alike.setdefault(ends, {})[int(found[digit])] = name
+    for of in alike.values():
+        first = min(of)
+        if first < 2 and len(of) > 1 and sorted(of) == list(range(first, first + len(of))):
+            return tuple(of[number] for number in sorted(of))
+    return ()
 
 
 def _scalars(source: Source, plain: dict[str, str], keys: tuple[str, ...]) -> list[Guess]:
@@ -384,7 +400,7 @@ def _scalars(source: Source, plain: dict[str, str], keys: tuple[str, ...]) -> li
     for key in keys:
         for short, name in plain.items():
             values = _numbers(source, name)
-            if re.search(_SCALARS[key], short) and len(values):
+            if re.search(_SCALARS[key], short) and len(np.unique(values)) > 1:
                 found.append(_scalar(key, name, _named_unit(short), values))
                 break
     return found

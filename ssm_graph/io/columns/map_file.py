@@ -167,9 +167,8 @@ def read_map(path: Path) -> ColumnMap:
             raise ConfigError(
                 f"{path.name} {name}: unknown section; {nearest_hint(name, QUANTITIES)}"
             )
-    for name in ("imu", "dvl"):
-        if name not in raw:
-            raise ConfigError(f"{path.name} [{name}]: the section is missing; a mission needs it")
+    if "imu" not in raw:
+        raise ConfigError(f"{path.name} [imu]: the section is missing; a mission needs it")
     return ColumnMap(
         path,
         None if vehicle is None else path.parent / vehicle,

@@ -23,7 +23,9 @@ from ssm_graph.base.progress import told
 from ssm_graph.io.file_kind import CSV_ENDINGS
 from ssm_graph.io.tables.files import pyarrow_module
 
-ENDINGS: Final = (*CSV_ENDINGS, ".parquet", ".mat", ".h5", ".hdf5")
+_HDF5: Final = (".h5", ".hdf5", ".nc")
+"""NetCDF 4 is HDF5."""
+ENDINGS: Final = (*CSV_ENDINGS, ".parquet", ".mat", *_HDF5)
 _DELIMITERS: Final = ",;\t|"
 _BLANK: Final = " "
 """Any number of them, where none of the above is there."""
@@ -105,7 +107,7 @@ def read_source(path: Path) -> Source:
             return _parquet(path)
         if ending == ".mat":
             return _mat(path)
-        if ending in (".h5", ".hdf5"):
+        if ending in _HDF5:
             return Source(path.name, _hdf5(path))
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error

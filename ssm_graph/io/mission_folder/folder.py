@@ -192,15 +192,20 @@ def write_mission(
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     settings = mission_settings(mission, table_format)
-    parts = {}
-    for section, columns in mission_tables(mission).items():
-        path = folder / settings[section]["file"]
-        parts[path] = path.with_name(f"{path.stem}.part{path.suffix}")
-        write_table(parts[path], columns)
-    terrain = mission.aids.get(TerrainLog)
-    if terrain is not None:
-        write_map(folder, terrain)
-    toml_part = write_toml_part(folder, settings)
+    parts: dict[Path, Path] = {}
+    try:
+        for section, columns in mission_tables(mission).items():
+            path = folder / settings[section]["file"]
+            parts[path] = path.with_name(f"{path.stem}.part{path.suffix}")
+            write_table(parts[path], columns)
+        terrain = mission.aids.get(TerrainLog)
+        if terrain is not None:
+            write_map(folder, terrain)
+        toml_part = write_toml_part(folder, settings)
+    except BaseException:  # a full disk, or somebody who would not wait
+        for part in (*parts.values(), folder / f"{TOML_NAME}.part"):
+            part.unlink(missing_ok=True)
+        raise
     (folder / TOML_NAME).unlink(missing_ok=True)
     for path, part in parts.items():
         part.replace(path)

@@ -251,10 +251,14 @@ def _rates_at_rest(mission: Mission, ping_s: Array, label: str) -> list[str]:
     imu, noise = mission.imu, mission.imu.noise
     spread = np.hypot(noise.gyro_bias_sigma, noise.gyro_density / _REST_S**0.5)
     limit = EARTH_RATE + _BIAS_SIGMAS * float(spread)
-    for begin in np.arange(imu.start_s, imu.time_s[-1] - _REST_S, _REST_S):
-        now = (imu.time_s > begin) & (imu.time_s <= begin + _REST_S)
-        speed = mission.dvl.speed[(ping_s > begin) & (ping_s <= begin + _REST_S)]
-        if now.sum() < _FEWEST_PINGS or not np.isfinite(speed).any():
+    begins = np.arange(imu.start_s, imu.time_s[-1] - _REST_S, _REST_S)
+    samples, pings = (
+        np.searchsorted(time_s, np.column_stack([begins, begins + _REST_S]), side="right")
+        for time_s in (imu.time_s, ping_s)
+    )
+    for begin, of_imu, of_dvl in zip(begins, samples.tolist(), pings.tolist(), strict=True):
+        now, speed = slice(*of_imu), mission.dvl.speed[slice(*of_dvl)]
+        if of_imu[1] - of_imu[0] < _FEWEST_PINGS or not np.isfinite(speed).any():
             continue
         is_still = np.max(np.std(imu.accel_b[now], axis=0)) < _REST_FORCE
         is_still &= np.max(np.std(imu.gyro_b[now], axis=0)) < _REST_RATE

@@ -43,7 +43,10 @@ from ssm_graph.live.protocols.nmea_fields import (
 )
 from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
 from ssm_graph.live.recorded.water_linked_table import SIGN, rows_of
+from ssm_graph.sensors.compass import HeadingReading
+from ssm_graph.sensors.depth import DepthReading
 from ssm_graph.sensors.dvl import DvlMount, Ping, empty_dvl
+from ssm_graph.sensors.gnss import Fix
 from ssm_graph.sensors.messages import Message
 from ssm_graph.sensors.registry import BY_MESSAGE
 
@@ -64,15 +67,28 @@ _BINARY: Final[Sequence[tuple[Callable[[bytes], bool], Callable[[Path], Any]]]] 
     (is_pd6, read_pd6),
 )
 """Makers' own formats: by the first bytes whether a file is of one, and what reads it."""
+_COUNTED: Final[Mapping[type[Message], str]] = {
+    Ping: "pings",
+    Fix: "positions",
+    DepthReading: "depths",
+    HeadingReading: "headings",
+}
 
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
     """What a recording holds."""
 
+    about: str
+    """Its format, and how many reports of what."""
     messages: tuple[Message, ...]
     notes: tuple[str, ...]
     """What was left out or assumed, one sentence each."""
+
+    @property
+    def told(self) -> tuple[str, ...]:
+        """What it is, then what was left out or assumed."""
+        return self.about, *self.notes
 
 
 def read_recorded(log: Path, options: NmeaOptions | None = None) -> Recorded | None:
@@ -88,7 +104,7 @@ def read_recorded(log: Path, options: NmeaOptions | None = None) -> Recorded | N
     binary = next((read for is_it, read in _BINARY if is_it(head)), None)
     if binary is not None:
         read = binary(log)
-        found = Recorded(read.messages, (read.about, *read.notes))
+        found = Recorded(read.about, read.messages, read.notes)
     elif b"'transducers'" in head and b'"' not in head:  # as Python prints what it has parsed
         found = _water_linked(_OF_PYTHON.sub(lambda found: _PYTHON[found[0]], data))
     elif b'"transducers"' in head or (head.lstrip()[:1] in (b"{", b"[") and b'"' in head):
@@ -100,12 +116,25 @@ def read_recorded(log: Path, options: NmeaOptions | None = None) -> Recorded | N
     else:
         return None
     if not found.messages:
-        raise DataError(f"{log}: not one report that is read; {'; '.join(found.notes) or 'empty'}")
+        said = "; ".join(found.notes) or "empty"
+        raise DataError(f"{log}: {found.about}, not one report that is read; {said}")
     pings = [message for message in found.messages if isinstance(message, Ping)]
     if pings and not any(math.isfinite(speed) for ping in pings for speed in ping.speed):
         said = f"{len(pings)} pings and not one speed along a beam: the bottom was never in range?"
-        found = Recorded(found.messages, (said, *found.notes))
-    return _in_order(log, found)
+        found = replace(found, notes=(said, *found.notes))
+    return _in_order(log, _of_one_dvl(found))
+
+
+def _of_one_dvl(found: Recorded) -> Recorded:
+    """Return a recording without pings of another number of beams than most have."""
+    counts = Counter(len(one.speed) for one in found.messages if isinstance(one, Ping))
+    if len(counts) < 2:
+        return found
+    (n_beams, n_pings), *others = counts.most_common()
+    said = " and ".join(f"{count} of {n}" for n, count in others)
+    note = f"{n_pings} pings are of {n_beams} beams; {said} were left out: of another instrument?"
+    kept = [one for one in found.messages if not isinstance(one, Ping) or len(one.speed) == n_beams]
+    return Recorded(found.about, tuple(kept), (*found.notes, note))
 
 
 def _in_utf8(data: bytes) -> bytes:
@@ -168,7 +197,7 @@ def _in_order(log: Path, found: Recorded) -> Recorded:
         if count
     ]
     kept.sort(key=lambda message: message.time_s)
-    return Recorded(tuple(kept), (*found.notes, *notes))
+    return Recorded(found.about, tuple(kept), (*found.notes, *notes))
 
 
 def _said(refusals: list[str], n_refused: int) -> list[str]:
@@ -186,7 +215,10 @@ def _water_linked(data: bytes) -> Recorded:
     time_s, last_s, before, has_clock = 0.0, -math.inf, dict[str, Any](), True
     for text in told(framer.feed(data + b"\n"), len(data), size=len):
         report = _object(text)
-        time_s = _unix(report, time_s)
+        stated_s = _unix(report, time_s)
+        if messages and time_s < UNIX_FROM_S <= stated_s:  # what came before gets that clock too
+            messages = [replace(one, time_s=one.time_s + stated_s - time_s) for one in messages]
+        time_s = stated_s
         if "time_of_validity" not in report and "transducers" in report:
             has_clock = False
             if report != before:
@@ -202,7 +234,7 @@ def _water_linked(data: bytes) -> Recorded:
             "them, from the first one on or from the stamps of the dead reckoning beside them; add "
             "what makes it the vehicle's."
         )
-    return Recorded(tuple(messages), tuple(notes))
+    return Recorded(_about("Water Linked JSON", messages), tuple(messages), tuple(notes))
 
 
 def _water_linked_table(data: bytes) -> Recorded:
@@ -217,7 +249,14 @@ def _water_linked_table(data: bytes) -> Recorded:
     notes = _said([*torn, *decoder.take_refusals()], len(torn) + decoder.n_refused)
     if decoder.n_repeats:
         notes.append(f"{decoder.n_repeats} reports came again and were left out.")
-    return Recorded(tuple(messages), tuple(notes))
+    about = _about("Water Linked, reports in a table", messages)
+    return Recorded(about, tuple(messages), tuple(notes))
+
+
+def _about(name: str, messages: Iterable[Message]) -> str:
+    """Return a format, and how many messages of which kind there are."""
+    counts = Counter(_COUNTED.get(type(message), "others") for message in messages)
+    return ", ".join([name, *(f"{count} {what}" for what, count in counts.items())])
 
 
 def _object(text: str) -> dict[str, Any]:
@@ -293,8 +332,8 @@ def _nmea(data: bytes, options: NmeaOptions) -> Recorded:
             f"its sentences are {', '.join(sorted(kinds)[:12]) or 'none that begins with $'}"
         )
     if first is None and messages:
-        return Recorded((), ("no sentence states a time, which depths and headings need",))
-    return Recorded(tuple(messages), tuple(notes))
+        messages, notes = [], ["no sentence states a time, which depths and headings need"]
+    return Recorded(_about("NMEA 0183", messages), tuple(messages), tuple(notes))
 
 
 def _is_read(kind: str, fields: list[str]) -> bool:

@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import os
+import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from fnmatch import fnmatch
 from heapq import merge
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frames import BodyAxes
+from ssm_graph.base.progress import told
+from ssm_graph.io.columns.convert import logs_of_columns
+from ssm_graph.io.columns.map_file import ColumnMap
+from ssm_graph.io.columns.sources import ENDINGS
 from ssm_graph.io.mission_folder.folder import read_mission
+from ssm_graph.io.mission_folder.toml import TOML_NAME
 from ssm_graph.io.raw_log.log import RawLog
 from ssm_graph.io.tables.files import read_table
 from ssm_graph.live.recorded.log import Recorded, read_recorded
 from ssm_graph.live.recorded.turns import clock_offset
-from ssm_graph.mission.mission import Mission
+from ssm_graph.mission.mission import Mission, Reference
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.compass import HeadingReading
 from ssm_graph.sensors.imu import IMU, ImuLog, ImuSample
@@ -60,18 +68,86 @@ def merge_recordings(
             f"expected one table with the columns of imu.csv among the files, got {len(own)}: "
             f"{', '.join(map(str, logs))}"
         )
-    imu = _inertial(own[0], vehicle)
-    notes: list[str] = []
-    streams = [list(IMU.messages_of(imu))]
-    known = {BY_LOG[kind].section for kind in vehicle.bare_logs}
+    recordings: dict[Path, Recorded] = {}
     for log in logs:
         if log is own[0]:
             continue
         found = read_recorded(log)
         if found is None:
             raise DataError(f"{log}: neither a table of inertial data nor a recording that is read")
+        recordings[log] = found
+    imu = _inertial(own[0], vehicle)
+    return _joined([imu], recordings, out, vehicle=vehicle, offset_s=offset_s)
+
+
+def merge_columns(
+    files: Sequence[Path],
+    column_map: ColumnMap,
+    out: Path,
+    *,
+    vehicle: Vehicle,
+    offset_s: float | None = None,
+) -> Merged | None:
+    """Write a mission folder of tables of any columns and recordings of other instruments.
+
+    A recording is a file that no section of the map names, of a maker's format. Without any this
+    returns None and writes nothing: the tables are all there is.
+
+    Raises :class:`ConfigError` and :class:`DataError` as :func:`merge_recordings` and
+    :func:`logs_of_columns` do, and for a map with a reference.
+
+    Parameters
+    ----------
+    files : the tables and the recordings.
+    column_map : what the columns of the tables are.
+    out, vehicle, offset_s : as of :func:`merge_recordings`.
+    """
+    found = {file: read_recorded(file) for file in not_tables(files, column_map)}
+    recordings = {file: one for file, one in found.items() if one is not None}
+    if not recordings:
+        return None
+    tables = [file for file in files if file not in recordings]
+    mapped = logs_of_columns(tables, column_map, vehicle)
+    if any(isinstance(log, Reference) for log in mapped.logs):
+        raise ConfigError(
+            f"{column_map.path.name} [reference]: not beside recordings: convert without it, and "
+            "put the table and its section of mission.toml into the folder"
+        )
+    made = _joined(mapped.logs, recordings, out, vehicle=vehicle, offset_s=offset_s)
+    return Merged(made.mission, (*mapped.notes, *made.notes))
+
+
+def not_tables(files: Sequence[Path], column_map: ColumnMap) -> list[Path]:
+    """Return the files beside the tables of a map that may be recordings.
+
+    No section names them; of a map with a DVL they have the ending of no table either.
+    """
+    has_dvl = "dvl" in {section.name for section in column_map.sections}
+    patterns = [section.file for section in column_map.sections if section.file]
+    return [
+        file
+        for file in files
+        if not any(fnmatch(file.name, pattern) for pattern in patterns)
+        and not (has_dvl and file.suffix.lower() in ENDINGS)
+    ]
+
+
+def _joined(
+    logs: Sequence[Any],
+    recordings: Mapping[Path, Recorded],
+    out: Path,
+    *,
+    vehicle: Vehicle,
+    offset_s: float | None,
+) -> Merged:
+    """Write the mission of logs, the IMU's among them, and recordings moved onto its clock."""
+    imu = next(log for log in logs if isinstance(log, ImuLog))
+    notes: list[str] = []
+    streams = [list(BY_LOG[type(log)].messages_of(log)) for log in logs]
+    known = {BY_LOG[kind].section for kind in vehicle.bare_logs}
+    for log, found in recordings.items():
         shift_s, said = _shift(log, found.messages, imu, offset_s)
-        notes += [*(f"{log.name}: {note}" for note in found.notes), said]
+        notes += [*(f"{log.name}: {note}" for note in found.told), said]
         streams += _on_clock(found.messages, shift_s, known)
     mission = _written(streams, out, vehicle)
     return Merged(mission, (*notes, *mission.notes))
@@ -89,14 +165,25 @@ def mission_of_recording(log: Path, found: Recorded, out: Path, *, vehicle: Vehi
         )
     known = {BY_LOG[kind].section for kind in vehicle.bare_logs}
     mission = _written(_on_clock(found.messages, 0.0, known), out, vehicle)
-    return Merged(mission, (*found.notes, *mission.notes))
+    return Merged(mission, (*found.told, *mission.notes))
 
 
 def _written(streams: Sequence[Sequence[Message]], out: Path, vehicle: Vehicle) -> Mission:
-    with RawLog(out, vehicle) as raw:
-        for message in merge(*streams, key=lambda message: message.time_s):
-            raw.append(message)
-    return read_mission(out)
+    """Write a mission folder, whole or not at all, and return what is in it."""
+    part = out.with_name(f".{out.name}.part-{os.getpid()}")
+    ordered = merge(*streams, key=lambda message: message.time_s)
+    try:
+        with RawLog(part, vehicle) as raw:
+            for message in told(ordered, sum(map(len, streams))):
+                raw.append(message)
+        mission = read_mission(part)
+        out.mkdir(parents=True, exist_ok=True)
+        (out / TOML_NAME).unlink(missing_ok=True)
+        for file in sorted(part.iterdir(), key=lambda file: file.name == TOML_NAME):
+            file.replace(out / file.name)
+        return mission
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
 
 
 def _is_inertial(log: Path) -> bool:

@@ -114,6 +114,7 @@ class ReplaySource:
             address,
             state,
             n_messages=self._n_messages,
+            rate_hz=self._n_messages / max(self.elapsed_s, 1.0),  # of the mission's time
             age_s=0.0,
             altitude_m=self._altitude_now(),
         )

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.progress import told
 from ssm_graph.base.times import is_inside
 from ssm_graph.mission.estimate import Estimate, Status
 from ssm_graph.mission.fault import DetectedFault, Treatment
@@ -165,7 +166,8 @@ def search(mission: Mission) -> list[Found]:
     found: list[Found] = []
     for _ in range(MOST):
         poor = evidence.poor(base)
-        tried = [evidence.best_of(family, base, poor) for family in families]
+        every = told(families, len(families))
+        tried = [evidence.best_of(family, base, poor) for family in every]
         sure = [best for best in tried if best is not None and best.is_sure]
         sure = [best for best in sure if not (best.is_far and _is_poor(evidence, best))]
         sure += _set_clocks(evidence, families, base, poor, sure)

@@ -35,6 +35,8 @@ MOST_ELLIPSES: Final = 60
 MOST_IN_SVG: Final = 1000
 """Markers of a beam that are drawn without WebGL, which is slow where it is not of a card."""
 MOST_LAGS: Final = 20
+FEW_DECADES: Final = 4
+"""Up to so many an axis has room for ticks at 2 and 5 as well."""
 BAND: Final = "rgba(0, 114, 178, 0.16)"
 
 
@@ -120,7 +122,7 @@ def _track(content: Content) -> list[Chart]:
     enu, rows = content.local_enu, content.trajectory
     kept = thinned(len(enu))
     hover = [
-        f"{_clock(content, t)}<br>height {h:.2f} m<br>sigma {s:.2f} m"
+        f"{_clock(content, t)}<br>height {h:.2f} m<br>sigma of an axis {s:.2f} m"
         for t, h, s in zip(
             rows["time_s"][kept].tolist(),
             rows["height_m"][kept].tolist(),
@@ -194,7 +196,7 @@ def _series(content: Content) -> Iterator[Chart]:
     if content.altitude is not None and np.isfinite(content.altitude[1]).any():
         time_s, altitude = content.altitude
         traces = [line(content.minutes(time_s), altitude, "altitude", ESTIMATE)]
-        layout = axes(MINUTES, "m", yaxis={"rangemode": "tozero"})
+        layout = axes(MINUTES, "altitude, m", yaxis={"rangemode": "tozero"})
         note = "Of the DVL, by the ranges of its beams; where it breaks no beam met the bottom."
         yield Chart("altitude", "Altitude over the bottom", note, traces, layout)
     traces = [
@@ -217,15 +219,15 @@ def _series(content: Content) -> Iterator[Chart]:
         line(t, np.hypot(east, north), "over ground", ESTIMATE),
         line(t, rows["vel_up_m_per_s"], "upwards", EAST_NORTH_UP[2]),
     ]
-    yield Chart("speed", "Speed", "", traces, axes(MINUTES, "m/s"))
+    yield Chart("speed", "Speed", "", traces, axes(MINUTES, "speed, m/s"))
     traces = [
         line(t, rows["roll_deg"], "roll", EAST_NORTH_UP[0]),
         line(t, rows["pitch_deg"], "pitch", EAST_NORTH_UP[1]),
     ]
-    yield Chart("attitude", "Roll and pitch", "", traces, axes(MINUTES, "degrees"))
+    yield Chart("attitude", "Roll and pitch", "", traces, axes(MINUTES, "angle, degrees"))
     heading = _unbroken(t, rows["heading_deg"])
     traces = [line(*heading, "heading", EAST_NORTH_UP[0])]
-    layout = axes(MINUTES, "degrees from north", yaxis={"tickvals": [0, 90, 180, 270, 360]})
+    layout = axes(MINUTES, "heading, degrees", yaxis={"tickvals": [0, 90, 180, 270, 360]})
     yield Chart("heading", "Heading", "", traces, layout)
     traces = [
         line(t, 3.0 * rows[f"sigma_{name}_deg"], f"3 sigma {name}", color)
@@ -260,7 +262,9 @@ def _scale(traces: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     if high <= 100.0 * low:
         return {"rangemode": "tozero"}
     ends = math.floor(math.log10(low)), math.ceil(math.log10(high))
-    ticks = [10.0**decade for decade in range(ends[0] - 1, ends[1] + 2)]
+    steps = (1.0, 2.0, 5.0) if ends[1] - ends[0] <= FEW_DECADES else (1.0,)
+    decades = range(ends[0] - 1, ends[1] + 2)
+    ticks = [step * 10.0**decade for decade in decades for step in steps]
     return {"type": "log", "tickvals": ticks, "ticktext": [f"{tick:g}" for tick in ticks]}
 
 
@@ -308,7 +312,7 @@ def _beams(content: Content) -> Iterator[Chart]:
     yield Chart("weights", "Weights of the DVL's beams", note, of_weight, layout)
     note = "Measured minus what the answer expects. Crosses may be far outside: zoom out."
     limit = 1e3 * 8.0 * float(np.median(np.abs(innovation))) or 1.0
-    layout = axes(MINUTES, "mm/s", yaxis={"range": [-limit, limit]})
+    layout = axes(MINUTES, "innovation, mm/s", yaxis={"range": [-limit, limit]})
     yield Chart("innovations", "Innovations of the DVL's beams", note, of_innovation, layout)
 
 
@@ -338,7 +342,7 @@ def _aids(content: Content) -> Iterator[Chart]:
         note = "Measured minus what the answer expects; a cross has a weight below 0.05."
         title = f"Innovations of {aid}"
         name = "aid" + "".join(filter(str.isalnum, aid))
-        yield Chart(name, title, note, traces, axes(MINUTES, str(unit)))
+        yield Chart(name, title, note, traces, axes(MINUTES, f"innovation, {unit}"))
 
 
 def _whiteness(content: Content) -> Iterator[Chart]:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.evaluation.errors import ErrorSeries
+
+Z95: Final = 1.9600
+"""Half-width that holds 95 % of a normal error, in sigmas."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,6 +33,9 @@ class Content:
     """Times (P,), s, and heights over the bottom (P,), m; None where nothing says."""
     errors: ErrorSeries | None = None
     """Against the mission's reference; None without one."""
+    data: Sequence[tuple[str, ...]] = ()
+    """Of each sensor of the mission, in words: name, rows, rate, jitter, gaps, s in gaps, what it
+    reads."""
 
     @property
     def begin_s(self) -> float:
@@ -61,5 +67,19 @@ class Content:
     @property
     def horizontal_sigma_m(self) -> Array:
         """(N,) root of the mean of the east and north variances: of a circle that is as large."""
+        return np.asarray(np.sqrt(0.5) * self._distance_rms_m)
+
+    @property
+    def radius_95_m(self) -> Array:
+        """(N,) m that hold the horizontal error in 95 % of all cases at least.
+
+        So large is the circle round an error along one line, whose share inside is 95 %. Errors of
+        the same mean square in both directions stay inside it in up to 97.9 %: the tables hold
+        sigmas along east and north, not how the two errors go together.
+        """
+        return np.asarray(Z95 * self._distance_rms_m)
+
+    @property
+    def _distance_rms_m(self) -> Array:
         rows = self.trajectory
-        return np.asarray(np.sqrt((rows["sigma_east_m"] ** 2 + rows["sigma_north_m"] ** 2) / 2.0))
+        return np.asarray(np.hypot(rows["sigma_east_m"], rows["sigma_north_m"]))

@@ -3,7 +3,7 @@ const charts = JSON.parse(document.getElementById("charts").textContent);
 const options = { displaylogo: false, modeBarButtonsToRemove: ["lasso2d", "select2d"] };
 const base = {
   margin: { l: 64, r: 12, t: 30, b: 44 }, hovermode: "closest",
-  legend: { orientation: "h", yref: "container", y: 1, yanchor: "top", x: 0 },
+  legend: { orientation: "h", yref: "container", y: 1, yanchor: "top", x: 0, itemsizing: "constant" },
   font: { family: "system-ui, 'Segoe UI', 'Liberation Sans', sans-serif", size: 13, color: "#1f2a33" },
   paper_bgcolor: "#ffffff", plot_bgcolor: "#ffffff",
 };

@@ -10,8 +10,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from ssm_graph.base.frozen import Array
+from ssm_graph.base.runs import runs_of
 from ssm_graph.report.clock import clocked
-from ssm_graph.report.page.content import Content
+from ssm_graph.report.page.content import Z95, Content
 
 VERDICTS: Final = {
     "CONVERGED": ("✔", "good", "The answer may be used: nothing in the data contradicts it."),
@@ -25,10 +27,10 @@ VERDICTS: Final = {
     "DIVERGED": ("✖", "bad", "No answer: the solution ran away."),
 }
 """Sign, style and meaning of each status; the sign says without colour what the colour says."""
-R95: Final = 2.4477
-"""Radius that holds 95 % of a circular normal error, in sigmas of one axis."""
-Z95: Final = 1.9600
-"""Half-width that holds 95 % of a normal error, in sigmas."""
+NOTHING: Final = "\u2013"
+"""In a cell where there is nothing to say."""
+MOST_STRETCHES: Final = 3
+"""Of time in which a limit is not met that are told one by one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,17 +77,17 @@ def _local(summary: Mapping[str, Any]) -> str:
 
 
 def _facts(content: Content) -> Iterable[tuple[str, str]]:
-    summary, sigma = content.summary, content.horizontal_sigma_m
+    summary, radius_m = content.summary, content.radius_95_m
     duration_s = float(summary.get("duration_s") or 0.0)
     yield "mission", str(summary.get("mission"))
     yield "method, kernel", f"{summary.get('method')}, {summary.get('kernel')}"
     yield "begin", _when(content, content.begin_s)
     yield "duration", f"{duration_s / 60.0:.1f} min"
     yield "path length", f"{summary.get('total_path_length_m') or 0.0:.0f} m"
-    known = sigma[np.isfinite(sigma)]
+    known = radius_m[np.isfinite(radius_m)]
     if len(known):
-        yield "position at the end, 95\u00a0%", f"{R95 * sigma[-1]:.2f} m"
-        yield "position at the worst, 95\u00a0%", f"{R95 * known.max():.2f} m"
+        yield "position at the end, 95\u00a0%", f"{radius_m[-1]:.2f} m"
+        yield "position at the worst, 95\u00a0%", f"{known.max():.2f} m"
     n_beams, n_out = summary.get("n_beams") or 0, summary.get("n_outliers") or 0
     if n_beams:
         yield "beam speeds left out", f"{n_out} of {n_beams} ({100.0 * n_out / n_beams:.1f} %)"
@@ -106,6 +108,7 @@ def sections(content: Content) -> list[tuple[str, str]]:
         ("Sensors that were off", _faults(content)),
         ("Beams", _beams(content)),
         ("Further measurements", _aids(content)),
+        ("Data quality", _data(content)),
         ("Against the reference", _reference(content.summary)),
         ("Calibration", _calibration(content.summary)),
         ("Position uncertainty for surveys", _survey(content)),
@@ -116,10 +119,13 @@ def sections(content: Content) -> list[tuple[str, str]]:
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Return a table; cells that are numbers in words stand to the right."""
+    """Return a table; a cell with nothing to say has a dash."""
     head = "".join(f"<th>{_text(name)}</th>" for name in header)
     body = "".join(
-        "<tr>" + "".join(f"<td>{_text(cell)}</td>" for cell in row) + "</tr>" for row in rows
+        "<tr>"
+        + "".join(f"<td>{_text(NOTHING if cell == '' else cell)}</td>" for cell in row)
+        + "</tr>"
+        for row in rows
     )
     inside = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
     return f'<div class="scroll">{inside}</div>'
@@ -237,7 +243,8 @@ def _reference(summary: Mapping[str, Any]) -> str:
         "rmse_heading_deg": "heading error, rms, degrees",
         "nees_position": "NEES of the position over 3; 1 is expected",
     }
-    rows = [(label, _number(summary.get(key))) for key, label in names.items()]
+    told = {label: summary.get(key) for key, label in names.items()}
+    rows = [(label, _number(value)) for label, value in told.items() if value is not None]
     inside = summary.get("inside_3_sigma") or {}
     shares = ", ".join(
         f"{axis} {100.0 * share:.1f}" for axis, share in inside.items() if share is not None
@@ -263,24 +270,44 @@ def _calibration(summary: Mapping[str, Any]) -> str:
 
 def _survey(content: Content) -> str:
     """Return how much of the time the position alone meets the orders of S-44."""
-    horizontal = R95 * content.horizontal_sigma_m
+    horizontal = content.radius_95_m
     vertical = Z95 * content.trajectory["sigma_up_m"]
-    rows = [
-        (
-            order.name,
-            f"{order.horizontal_m:g}",
-            f"{100.0 * np.mean(horizontal <= order.horizontal_m):.1f}",
-            f"{order.vertical_m:g}",
-            f"{100.0 * np.mean(vertical <= order.vertical_m):.1f}",
-        )
-        for order in ORDERS
-    ]
+    rows = []
+    for order in ORDERS:
+        cells, is_met = [order.name], np.ones(len(vertical), bool)
+        for limit, of in ((order.horizontal_m, horizontal), (order.vertical_m, vertical)):
+            cells += [f"{limit:g}", f"{100.0 * np.mean(of <= limit):.1f}"]
+            is_met &= of <= limit
+        rows.append((*cells, _stretches(content, ~is_met)))
     header = ("order", "horizontal limit, m, 95 %", "met, % of the time", "vertical limit, m, 95 %")
     return (
         "<p>Of the vehicle's position alone, against what IHO S-44 (edition 6.1) allows a whole "
         "sounding in depth zero, where its limits are tightest. Whether a sounding meets an order "
-        "depends on the echo sounder too.</p>" + table((*header, "met, % of the time"), rows)
+        "depends on the echo sounder too.</p>"
+        + table((*header, "met, % of the time", "not met, minutes"), rows)
     )
+
+
+def _stretches(content: Content, is_so: Array) -> str:
+    """Return from which minute to which something is so, the longest stretches."""
+    minutes = content.since_min
+    runs = [(minutes[begin], minutes[end - 1]) for begin, end in runs_of(is_so)]
+    longest = sorted(runs, key=lambda run: run[0] - run[1])[:MOST_STRETCHES]
+    told = ", ".join(f"{begin:.1f} to {end:.1f}" for begin, end in sorted(longest))
+    more = len(runs) - len(longest)
+    return f"{told} and {more} shorter" if more > 0 else told
+
+
+def _data(content: Content) -> str:
+    """Return how regular each sensor of the mission is, and what it reads."""
+    if not content.data:
+        return ""
+    header = ("", "rows", "rate, Hz", "jitter, ms", "gaps", "in gaps, s")
+    reads = "".join(
+        f"<li>{_text(f'{name}: {clocked(said, content.begin_s, content.epoch_s)}')}</li>"
+        for name, *_, said in content.data
+    )
+    return table(header, [row[:-1] for row in content.data]) + f"<ul>{reads}</ul>"
 
 
 def _assumed(content: Content) -> str:
@@ -305,7 +332,8 @@ def _settings(summary: Mapping[str, Any]) -> str:
         rows.append(("mission folder", inputs.get("folder")))
     for name, digest in (inputs.get("sha256") or {}).items():
         rows.append((f"SHA-256 of {name}", digest))
-    return table(("", ""), [(name, "" if value is None else value) for name, value in rows])
+    cells = [(name, "" if value is None else value) for name, value in rows]
+    return f'<div class="long">{table(("", ""), cells)}</div>'
 
 
 def _number(value: Any) -> str:
