@@ -115,10 +115,26 @@ class LineIndex:
         return *self._off(x, y, segment), segment
 
     def foot(self, x_y: Array) -> Foot:
-        """Return the nearest places on lines to points (..., 2), m."""
-        dx, dy, segment = self.off(x_y[..., 0], x_y[..., 1])
-        is_none = segment == len(self.start) - 1
-        distance = np.where(is_none, np.inf, np.sqrt(dx * dx + dy * dy))
+        """Return the nearest places on lines to points (..., 2), m.
+
+        From the piece that is nearest to the middle of a point's cell on along its line, until none
+        of its neighbours is nearer to the point.
+        """
+        x, y = x_y[..., 0], x_y[..., 1]
+        dx, dy, segment = self.off(x, y)
+        none = len(self.start) - 1
+        goes_on = True
+        while goes_on:
+            goes_on = False
+            for step in (-1, 1):
+                beside = np.minimum(np.maximum(segment + step, 0), none)
+                beside = np.where(self.line_of[beside] == self.line_of[segment], beside, segment)
+                bx, by = self._off(x, y, beside)
+                nearer = bx * bx + by * by < dx * dx + dy * dy
+                segment = np.where(nearer, beside, segment)
+                dx, dy = np.where(nearer, bx, dx), np.where(nearer, by, dy)
+                goes_on |= bool(nearer.any())
+        distance = np.where(segment == none, np.inf, np.sqrt(dx * dx + dy * dy))
         return Foot(distance, segment, x_y - np.stack([dx, dy], axis=-1))
 
     def is_painted_otherwise(self, seen: Array, segment: _Pieces) -> NDArray[np.bool_]:
