@@ -130,8 +130,8 @@ class Refined(ReadOnlyArrays):
         across = np.array([-self.ahead[1], self.ahead[0]])
         variance = float(across @ self.covs[-1][:2, :2] @ across)
         cov = variance * np.outer(across, across) + along_m**2 * np.outer(self.ahead, self.ahead)
-        across, along = sigmas_of(self.poses[-1], cov)
-        return self._on_bend(across, along), along, self.sigmas[2]
+        across_m, along_m = sigmas_of(self.poses[-1], cov)
+        return self._on_bend(across_m, along_m), along_m, self.sigmas[2]
 
 
 def sigmas_of(pose: Array, cov: Array) -> tuple[float, float]:
@@ -153,6 +153,8 @@ class _Lines:
         self.window, self.indices, self.settings = window, indices, settings
         s = settings
         self.of: NDArray[np.int64] = window.picture.astype(int)
+        self.counted: NDArray[np.bool_] = np.ones(window.points.shape[:2], dtype=bool)
+        self.crosses = self.counted
         self.scatter_m = float(np.hypot(s.scatter_m, s.map_sigma_m * np.sqrt(window.overlap)))
 
     def tie(self, poses: Array, *, is_late: bool = False) -> None:

@@ -208,8 +208,10 @@ class LineIndex:
         if len(near) > _FEW:
             at = np.column_stack([x, y])
             _, point = self.tree.query(at, distance_upper_bound=self.reach_m)
-            return np.append(self.owner, none)[point]
+            found: _Pieces = np.append(self.owner, np.int32(none))[point]
+            return found
         dx, dy = self._off(x[:, None], y[:, None], near[None])
         distance_sq = dx * dx + dy * dy
-        found = near[distance_sq.argmin(axis=1)]
-        return np.where(distance_sq.min(axis=1) < self.reach_m**2, found, none)
+        best = near[distance_sq.argmin(axis=1)]
+        is_near = distance_sq.min(axis=1) < self.reach_m**2
+        return np.asarray(np.where(is_near, best, none), dtype=np.int32)
