@@ -59,9 +59,7 @@ def follow(
     first = 0
     for last, (when, _) in enumerate(groups):
         times = np.array([t for t, _ in groups[first : last + 1]])
-        motion = dead_reckoned(
-            np.zeros(3), times, drive.chassis, scale=1.0 + prior.mean[3], bias=prior.mean[4]
-        )
+        motion = dead_reckoned(np.zeros(3), times, drive.chassis)
         if len(poses) == 0:
             poses = prior.mean[None, :3]
         else:

@@ -18,10 +18,15 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import DEGREE, wrapped
 from ssm_graph.filters.rules.hypotheses import Hypothesis, apart_from_each_other, told
 from ssm_graph.filters.rules.particles import normalised
-from ssm_graph.systems.road_map.locator import INDEPENDENT_M, LocatorSettings
+from ssm_graph.systems.road_map.locator import (
+    INDEPENDENT_M,
+    LocatorSettings,
+    laid,
+    likelihood_of_points,
+)
 from ssm_graph.systems.road_map.maps.index import LineIndex
-from ssm_graph.systems.road_map.maps.road_map import LineKind, Mark
-from ssm_graph.systems.road_map.window import Window, in_plane
+from ssm_graph.systems.road_map.maps.road_map import LineKind
+from ssm_graph.systems.road_map.window import Window
 
 LATERAL_M: Final = 1.2
 """Places closer to each other across the road are one lane ..."""
@@ -38,6 +43,8 @@ _KEPT: Final = 40
 SLIDE_M: Final = 24.0
 """How far along the lane a place is looked for anew."""
 _ROUNDS: Final = 5
+_HELD_ROUNDS: Final = 3
+"""Along a lane: each place begins where the one before it was fitted."""
 ALONG_STEP_M: Final = 2.0
 """Between the places along a lane that are compared with each other."""
 _HELD: Final = 1e6
@@ -230,26 +237,10 @@ def _log_likelihood(
     wider_m: float,
 ) -> Array:
     """Return the log likelihood (n,) of the window that ends at the poses (n, 3)."""
-    poses = window.poses_from(last)[:, window.picture.astype(int)]
-    total = np.zeros(len(last))
-    n_points = window.points.shape[1]
-    for kind, index in indices.items():
-        mine = window.kind == kind
-        if not mine.any():
-            continue
-        how = settings.line if kind is LineKind.LANE_LINE else settings.boundary
-        x, y = in_plane(poses[:, mine, None], window.points[mine])
-        distance, segment = index.nearest(x, y)
-        sigma = how.sigma_m + wider_m
-        cost = np.minimum(np.square(distance / sigma), how.cap_sq)
-        total -= 0.5 * how.information / n_points * cost.sum(axis=(1, 2))
-        if kind is LineKind.LANE_LINE:
-            seen = window.mark[mine][:, None]
-            there = index.mark[segment]
-            wrong = (there != Mark.UNKNOWN) & (seen != Mark.UNKNOWN) & (there != seen)
-            wrong &= cost < how.cap_sq
-            total -= settings.wrong_mark / n_points * wrong.sum(axis=(1, 2))
-    return total
+    return likelihood_of_points(
+        *(last, window.stiff, window.kind, window.mark, indices, settings),
+        dict.fromkeys(indices, wider_m),
+    )
 
 
 def _apart_from_each_other(poses: Array, value: Array, most: int) -> list[int]:
@@ -280,31 +271,29 @@ def _fitted(
     are held move across their course only, and turn.
     """
     at: Array = last.copy()
-    for number in range(_ROUNDS):
+    points = window.stiff
+    for number in range(_HELD_ROUNDS if is_held else _ROUNDS):
         wider_m = first_m * 0.4**number
         hessian = np.zeros((len(at), 3, 3)) + np.diag([0.05, 0.05, 30.0])
         if is_held:
             ahead = np.column_stack([np.cos(at[:, 2]), np.sin(at[:, 2])])
             hessian[:, :2, :2] += _HELD * ahead[:, :, None] * ahead[:, None]
         slope = np.zeros((len(at), 3))
-        poses = window.poses_from(at)[:, window.picture.astype(int)]
         for kind, index in indices.items():
             mine = window.kind == kind
             if not mine.any():
                 continue
             how = settings.line if kind is LineKind.LANE_LINE else settings.boundary
-            x, y = in_plane(poses[:, mine, None], window.points[mine])
-            foot = index.foot(np.stack([x, y], axis=-1))
-            nx, ny = np.moveaxis(index.normal[foot.segment], -1, 0)
-            error = nx * (x - foot.x_y[..., 0]) + ny * (y - foot.x_y[..., 1])
+            x, y = laid(at, points[mine])
+            dx, dy, segment = index.off(x, y)
+            normal = index.normal.take(segment, axis=0)
+            nx, ny = normal[..., 0], normal[..., 1]
             sigma = how.sigma_m + wider_m
-            counted = (foot.distance < np.sqrt(how.cap_sq) * sigma) / sigma**2
+            counted = (dx * dx + dy * dy < how.cap_sq * sigma**2) / sigma**2
             # In world axes, and turned about the last picture's position.
-            turn = ny * (x - at[:, 0, None, None]) - nx * (y - at[:, 1, None, None])
-            block = np.stack([nx, ny, turn], axis=-1).reshape(len(at), -1, 3)
-            said = (block * counted.reshape(len(at), -1, 1)).swapaxes(1, 2)
-            hessian += said @ block
-            slope += (said @ error.reshape(len(at), -1, 1))[..., 0]
+            block = np.stack([nx, ny, ny * (x - at[:, 0]) - nx * (y - at[:, 1])])
+            hessian += np.einsum("apn,pn,bpn->nab", block, counted, block)
+            slope += np.einsum("apn,pn->na", block, counted * (nx * dx + ny * dy))
         step = np.linalg.solve(hessian, slope[..., None])[..., 0]
         at = at - step
     return at

@@ -43,14 +43,8 @@ from ssm_graph.systems.road_map.maps.index import LineIndex
 from ssm_graph.systems.road_map.maps.road_map import LineKind, RoadMap
 from ssm_graph.systems.road_map.motion import first_course
 from ssm_graph.systems.road_map.plausible import require_plausible
-from ssm_graph.systems.road_map.refinement import (
-    Prior,
-    Refined,
-    RefinementSettings,
-    refine,
-    sigmas_of,
-    without_chance,
-)
+from ssm_graph.systems.road_map.prior import ALONG_INFLATION, prior_of
+from ssm_graph.systems.road_map.refinement import Refined, RefinementSettings, refine, sigmas_of
 from ssm_graph.systems.road_map.simulate import indices_of
 from ssm_graph.systems.road_map.verdict import (
     Verdict,
@@ -61,9 +55,6 @@ from ssm_graph.systems.road_map.window import Window, window_of
 
 SENSOR_REACH_M: Final = 60.0
 """Beyond the square of the fix, what the camera can see."""
-ALONG_INFLATION: Final = 1.5
-"""By which the particles' sigma along the road is too small, on routes 0 to 39: they take the
-errors of the map for what tells one place from another."""
 LOST: Final = 4.0
 """Log evidence by which another place must be better for the particles to be put there."""
 MOST_PICTURES: Final = 60
@@ -262,16 +253,16 @@ class Localiser:
             first -= 1
         n = min(row - first + 1, MOST_PICTURES)
         groups = self.groups[number - n + 1 : number + 1]
-        return self._window(groups)
-
-    def _window(self, groups: list[tuple[float, slice]]) -> Window | None:
         mean = self.extras[-1][0]
+        return self._window(groups, float(mean[SCALE]), float(mean[BIAS]))
+
+    def _window(
+        self, groups: list[tuple[float, slice]], scale: float = 0.0, bias: float = 0.0
+    ) -> Window | None:
         times = np.array([g[0] for g in groups])
         t0 = max(float(self.drive.chassis.time_s[0]), float(times[0]))
         times = np.maximum(times, t0)
-        motion = dead_reckoned(
-            np.zeros(3), times, self.drive.chassis, scale=1.0 + mean[SCALE], bias=mean[BIAS]
-        )
+        motion = dead_reckoned(np.zeros(3), times, self.drive.chassis, scale=1.0 + scale, bias=bias)
         return window_of(self.drive.curves, groups, motion, self.settings.n_points)
 
     def _judge(self, number: int) -> None:
@@ -345,7 +336,7 @@ class Localiser:
         reason = ""
         if verdict is Verdict.CONVERGED:
             try:
-                refined, window = self._refine()
+                refined, window = self._refined()
             except SolverError as error:
                 reason = str(error)
         if refined is not None:
@@ -398,6 +389,20 @@ class Localiser:
             refined = self._refine(mean)[0] or refined
         return refined.beside(mean), refined.with_along(along), refined
 
+    def _refined(self) -> tuple[Refined | None, Window | None]:
+        """Lay the window on the map from the particles.
+
+        Where that ends at a place that the last stretch does not allow, from the one that it does.
+        """
+        refined, window = self._refine()
+        stretch = self._stretch(len(self.rows) - 1)
+        if refined is None or stretch is None or not self.hypotheses:
+            return refined, window
+        best = np.array(self.hypotheses[0].pose)
+        both = np.stack([refined.poses[-1], best])
+        found = evidence_of(stretch, both, self.indices, self.settings)
+        return self._refine(best) if found[1] > found[0] + LOST else (refined, window)
+
     def _refine(self, last: Array | None = None) -> tuple[Refined | None, Window | None]:
         """Lay the last pictures on the map as a graph, begun by the particles before them.
 
@@ -411,17 +416,13 @@ class Localiser:
         first = len(self.rows) - n
         mean, cov = self.extras[first]
         if first < self.put_row:  # the particles were elsewhere then
-            mean, cov = self.extras[-1][0].copy(), 4.0 * self.extras[-1][1]
-            mean[:3] = window.poses_from(mean[:3])[0]
+            cov = 4.0 * self.extras[-1][1]
+            mean = np.concatenate([window.poses_from(self.rows[-1][1])[0], mean[3:]])
         if last is not None:
             mean = np.concatenate([window.poses_from(last)[0], mean[3:]])
-        floor = np.diag([0.05, 0.05, 0.2 * DEGREE, 1e-3, 1e-5]) ** 2
-        cov = cov + floor
-        if n == len(self.rows):
-            cov = cov + np.diag([self.half_m**2 / 3.0, self.half_m**2 / 3.0, 0.0, 0.0, 0.0])
-        cov = ALONG_INFLATION**2 * without_chance(mean, cov)
-        prior = Prior(mean, np.asarray(np.linalg.inv(cov), dtype=np.float64))
-        start = window.poses_from(self.rows[-1][1])
+        spread_m = self.half_m / np.sqrt(3.0) if n == len(self.rows) else 0.0
+        prior = prior_of(mean, cov, self.settings, spread_m)
+        start = window.poses_from(self.rows[-1][1] if last is None else last)
         return refine(window, start, prior, self.indices, self.refinement), window
 
 

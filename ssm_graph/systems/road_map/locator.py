@@ -13,8 +13,8 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import DEGREE, wrapped
 from ssm_graph.filters.rules.particles import Particles, drawn_anew, systematic
 from ssm_graph.systems.road_map.drive import Curves
-from ssm_graph.systems.road_map.maps.index import LineIndex
-from ssm_graph.systems.road_map.maps.road_map import LineKind, Mark
+from ssm_graph.systems.road_map.maps.index import LineIndex, in_blocks
+from ssm_graph.systems.road_map.maps.road_map import LineKind
 
 X, Y, YAW, SCALE, BIAS = range(5)
 """Columns of a particle: m, m, rad, share of the speed beyond 1, rad/s."""
@@ -148,35 +148,61 @@ def log_likelihood(
 
         information * mean_j( -min((D_j / s)^2, cap) / 2 ),    s = sigma + annealed exp(-k / K)
     """
-    fade = float(np.exp(-n_pictures / settings.annealing))
-    total = np.zeros(len(states))
-    points = curves.points(rows, settings.n_points)
-    kinds, marks = curves.kind[rows], curves.mark[rows]
-    c, s = np.cos(states[:, YAW]), np.sin(states[:, YAW])
-    for kind, index in indices.items():
-        mine = kinds == kind
-        if not mine.any():
-            continue
-        how = settings.line if kind is LineKind.LANE_LINE else settings.boundary
-        body = points[mine]
-        px, py = body[..., 0].reshape(-1), body[..., 1].reshape(-1)
-        wx = states[:, X, None] + c[:, None] * px - s[:, None] * py
-        wy = states[:, Y, None] + s[:, None] * px + c[:, None] * py
-        distance, segment = index.nearest(wx, wy)
-        sigma = how.sigma_m + how.annealed_m * fade
-        cost = np.minimum(np.square(distance * (1.0 / sigma)), how.cap_sq)
-        total -= 0.5 * how.information / settings.n_points * cost.sum(axis=1)
-        if kind is LineKind.LANE_LINE:
-            seen = np.repeat(marks[mine], settings.n_points)
-            there = index.mark[segment]
-            wrong = (there != Mark.UNKNOWN) & (seen != Mark.UNKNOWN) & (there != seen)
-            near = cost < how.cap_sq
-            total -= settings.wrong_mark / settings.n_points * (wrong & near).sum(axis=1)
-        elif settings.corridor_weight > 0.0:
-            total -= (
-                (1.0 - fade) * settings.corridor_weight * _in_corridor(states, curves, rows, index)
-            )
+    s = settings
+    fade = float(np.exp(-n_pictures / s.annealing))
+    wider_m = {
+        LineKind.BOUNDARY: s.boundary.annealed_m * fade,
+        LineKind.LANE_LINE: s.line.annealed_m * fade,
+    }
+    points, kind = curves.points(rows, s.n_points), curves.kind[rows]
+    total = likelihood_of_points(states, points, kind, curves.mark[rows], indices, s, wider_m)
+    index = indices.get(LineKind.BOUNDARY)
+    if index is not None and s.corridor_weight > 0.0:
+        total -= (1.0 - fade) * s.corridor_weight * _in_corridor(states, curves, rows, index)
     return total
+
+
+def likelihood_of_points(
+    states: Array,
+    points: Array,
+    kind: Array,
+    mark: Array,
+    indices: Mapping[LineKind, LineIndex],
+    settings: LocatorSettings,
+    wider_m: Mapping[LineKind, float],
+) -> Array:
+    """Return how well points (C, m, 2) of curves lie on the map's lines from poses (n, 3+): (n,).
+
+    The points are in the axes of each pose; ``kind`` and ``mark`` (C,) are the curves'.
+    ``wider_m`` is what is added to the sigma of each kind.
+    """
+    n_points = points.shape[1]
+    total = np.zeros(len(states))
+    for block in in_blocks(len(states), points.shape[0] * n_points):
+        for of_kind, index in indices.items():
+            mine = kind == of_kind
+            if not mine.any():
+                continue
+            how = settings.line if of_kind is LineKind.LANE_LINE else settings.boundary
+            dx, dy, segment = index.off(*laid(states[block], points[mine]))
+            sigma = how.sigma_m + wider_m[of_kind]
+            cost = np.minimum((dx * dx + dy * dy) * sigma**-2, how.cap_sq)
+            if of_kind is LineKind.LANE_LINE:
+                seen = np.repeat(mark[mine], n_points)[:, None]
+                wrong = index.is_painted_otherwise(seen, segment) & (cost < how.cap_sq)
+                cost += 2.0 * settings.wrong_mark / how.information * wrong
+            total[block] -= 0.5 * how.information / n_points * cost.sum(axis=0)
+    return total
+
+
+def laid(states: Array, points: Array) -> tuple[Array, Array]:
+    """Return x and y (p, n), m, of points (..., 2), p in all, in the axes of poses (n, 3+).
+
+    The poses come last: there are more of them than points, and what is long is fast.
+    """
+    px, py = points[..., 0].reshape(-1, 1), points[..., 1].reshape(-1, 1)
+    c, s = np.cos(states[:, YAW]), np.sin(states[:, YAW])
+    return c * px - s * py + states[:, X], s * px + c * py + states[:, Y]
 
 
 def _in_corridor(states: Array, curves: Curves, rows: slice, index: LineIndex) -> Array:
@@ -197,19 +223,14 @@ def _in_corridor(states: Array, curves: Curves, rows: slice, index: LineIndex) -
     x = np.linspace(low, high, 6)
     powers = x[:, None] ** np.arange(4)
     yl, yr = powers @ cubic[left[0]], powers @ cubic[right[0]]
+    y = yr + np.array([[0.3], [0.5], [0.7]]) * (yl - yr)
+    free = np.minimum(yl - y, y - yr) - 1.0
+    use = free > 0.3
+    points, free = np.stack([np.broadcast_to(x, y.shape)[use], y[use]], axis=-1), free[use][:, None]
     total = np.zeros(len(states))
-    c, s = np.cos(states[:, YAW]), np.sin(states[:, YAW])
-    for share in (0.3, 0.5, 0.7):
-        y = yr + share * (yl - yr)
-        free = np.minimum(yl - y, y - yr) - 1.0
-        use = free > 0.3
-        if not use.any():
-            continue
-        px, py = x[use], y[use]
-        wx = states[:, X, None] + c[:, None] * px - s[:, None] * py
-        wy = states[:, Y, None] + s[:, None] * px + c[:, None] * py
-        distance, _ = index.nearest(wx, wy)
-        total += (distance < free[use]).sum(axis=1)
+    for block in in_blocks(len(states), len(points)):
+        dx, dy, _ = index.off(*laid(states[block], points))
+        total[block] = (dx * dx + dy * dy < free * free).sum(axis=0)
     return np.minimum(total, 10.0)
 
 

@@ -36,9 +36,16 @@ _SAME_WAY: Final = 0.9
 """Cosine to the course beyond which a line runs along the road and not across it."""
 _LEAST_ARC_M: Final = 30.0
 """A shorter stretch of lines has no bend that could be told from kinks."""
-_BEND_M: Final = 0.15
+_HERE_M: Final = 20.0
+"""Lines within it tell how the road runs at the last pose: over a whole window at 25 m/s, 200 m,
+bends change, and an arc through all of them is up to 15 degrees off there."""
+_BEND_M: Final = 0.3
 """By how much, along the road, what a bend says is off in all pictures alike: its line in the map,
 and the cubic that is laid along it; measured on seeds below 100."""
+_FREE_ROUNDS: Final = 6
+"""Afterwards a point that once lay on no line counts no more, and one that once said nothing of the
+place along the road says nothing of it: points at the ends of lines would else come and go for
+ever, and the window with them. For the same reason steps are halved then."""
 _CLOSE_M: Final = 2e-4
 _CLOSE_RAD: Final = 1e-4
 
@@ -47,7 +54,7 @@ _CLOSE_RAD: Final = 1e-4
 class RefinementSettings:
     """Noise of the window; distances in m, angles in rad."""
 
-    rounds: int = 20
+    rounds: int = 12
     slope_sigma: float = 4e-3
     """Of a detected curve."""
     scatter_m: float = 0.02
@@ -93,26 +100,38 @@ class Refined(ReadOnlyArrays):
     has_settled: bool
     ahead: Array
     """(2,) of length 1, along the road at the last pose."""
+    bend: float
+    """1/m, of the road there, anticlockwise."""
     next_prior: Prior | None = None
     """Of the second pose, the first one being left behind."""
 
     @property
     def sigmas(self) -> tuple[float, float, float]:
         """Across and along the last pose [m], and its yaw [rad]."""
-        cov = self.covs[-1]
-        return *sigmas_of(self.poses[-1], cov), float(np.sqrt(cov[2, 2]))
+        across, along = sigmas_of(self.poses[-1], self.covs[-1])
+        return self._on_bend(across, along), along, float(np.sqrt(self.covs[-1][2, 2]))
+
+    def _on_bend(self, across_m: float, along_m: float) -> float:
+        """Return the sigma across with what a place off along a bend is beside it, m.
+
+        That is ``bend x^2 / 2`` with x off by ``along_m``: its mean square is 3/4 bend^2 along^4.
+        """
+        return float(np.hypot(across_m, np.sqrt(0.75) * self.bend * along_m**2))
 
     def beside(self, place: Array) -> Array:
         """Return the last pose (3,) moved along the road until it is beside a place (2+,)."""
         shift = float((place[:2] - self.poses[-1, :2]) @ self.ahead)
-        return np.asarray(self.poses[-1] + shift * np.array([*self.ahead, 0.0]))
+        aside = 0.5 * self.bend * shift**2
+        moved = shift * self.ahead + aside * np.array([-self.ahead[1], self.ahead[0]])
+        return np.asarray(self.poses[-1] + [*moved, self.bend * shift])
 
     def with_along(self, along_m: float) -> tuple[float, float, float]:
         """Return the same sigmas where the place along the road is known so well by other means."""
         across = np.array([-self.ahead[1], self.ahead[0]])
         variance = float(across @ self.covs[-1][:2, :2] @ across)
         cov = variance * np.outer(across, across) + along_m**2 * np.outer(self.ahead, self.ahead)
-        return *sigmas_of(self.poses[-1], cov), self.sigmas[2]
+        across_m, along_m = sigmas_of(self.poses[-1], cov)
+        return self._on_bend(across_m, along_m), along_m, self.sigmas[2]
 
 
 def sigmas_of(pose: Array, cov: Array) -> tuple[float, float]:
@@ -125,20 +144,6 @@ def sigmas_of(pose: Array, cov: Array) -> tuple[float, float]:
     )
 
 
-def without_chance(mean: Array, cov: Array) -> Array:
-    """Return a covariance (5, 5) of particles with what is along the pose tied to nothing else.
-
-    Few ancestors share all that is known along a road; how they happen to lie across it or turned
-    would, once that is known to centimetres, be taken for knowledge of the place along it.
-    """
-    c, s = np.cos(mean[2]), np.sin(mean[2])
-    turned = np.eye(5)
-    turned[:2, :2] = [[c, s], [-s, c]]
-    own = turned @ cov @ turned.T
-    own[0, 1:], own[1:, 0] = 0.0, 0.0
-    return np.asarray(turned.T @ own @ turned)
-
-
 class _Lines:
     """Curve points tied to the map at a set of poses: errors, normals, weights."""
 
@@ -148,10 +153,12 @@ class _Lines:
         self.window, self.indices, self.settings = window, indices, settings
         s = settings
         self.of: NDArray[np.int64] = window.picture.astype(int)
+        self.counted: NDArray[np.bool_] = np.ones(window.points.shape[:2], dtype=bool)
+        self.crosses = self.counted
         self.scatter_m = float(np.hypot(s.scatter_m, s.map_sigma_m * np.sqrt(window.overlap)))
 
-    def tie(self, poses: Array) -> None:
-        """Find the lines nearest to all points."""
+    def tie(self, poses: Array, *, is_late: bool = False) -> None:
+        """Find the lines nearest to all points; late, none that was left out comes back."""
         shape = self.window.points.shape
         at = poses[self.of][:, None]
         x_y = np.stack(in_plane(at, self.window.points), axis=-1)
@@ -173,13 +180,19 @@ class _Lines:
                 trust = np.where(wrong, trust * self.settings.wrong_mark, trust)
             self.trust[mine] = trust
             self.feet[mine] = np.where(trust[..., None] > 0.0, foot.x_y, x_y[mine])
-        self.ahead, self.bend = self._road(poses)
+        if is_late:
+            self.trust = np.where(self.counted, self.trust, 0.0)
+        self.ahead, self.bend = self.road(poses)
+        slant = np.abs(np.sum(self.normals * self._moved_along(self.feet, poses[-1, :2]), axis=-1))
+        crosses = slant > _SLANTED
+        self.crosses = crosses & self.crosses if is_late else crosses
+        self.counted = self.trust > 0.0
 
-    def _road(self, poses: Array) -> tuple[Array, float]:
+    def road(self, poses: Array, reach_m: float = np.inf) -> tuple[Array, float]:
         """Return the road's direction (2,) at the last pose and its bend, 1/m, anticlockwise.
 
-        A straight line is laid through the directions of the lines over the way; without lines the
-        road runs along the course.
+        A straight line is laid through the directions of the lines over the way, or of those within
+        a reach of the last pose; without lines the road runs along the course.
         """
         way = np.hypot(*np.diff(poses[:, :2], axis=0).T)
         s = np.concatenate([[0.0], np.cumsum(way)]) - way.sum()
@@ -190,12 +203,15 @@ class _Lines:
         use = (self.trust > 0.0) & (np.abs(forward) > _SAME_WAY)
         angle = (np.arctan(left / np.where(use, forward, 1.0)) + turn[self.of][:, None])[use]
         at = (s[self.of][:, None] + self.window.points[..., 0])[use]
+        angle, at = angle[np.abs(at) < reach_m], at[np.abs(at) < reach_m]
         bend, beside = 0.0, 0.0
         if len(at):
             middle, mean = at.mean(), angle.mean()
             if np.ptp(at) > _LEAST_ARC_M:
                 bend = float((at - middle) @ (angle - mean) / np.square(at - middle).sum())
             beside = float(mean - bend * middle)
+        if abs(beside) > np.arccos(_SAME_WAY):  # no line runs so here: they are of a junction
+            bend, beside = 0.0, 0.0
         yaw = poses[-1, 2] + beside
         return np.array([np.cos(yaw), np.sin(yaw)]), bend
 
@@ -222,7 +238,7 @@ class _Lines:
         slant = np.sum(self.normals * self._moved_along(self.feet, last), axis=-1)
         own = self._moved_along(pose[:, :2], last)
         own /= np.maximum(np.square(own).sum(axis=-1, keepdims=True), 0.1)
-        slant = np.where(np.abs(slant) < _SLANTED, slant, 0.0)
+        slant = np.where(self.crosses, 0.0, slant)
         said = self.normals - slant[..., None] * own[:, None]
         block = np.concatenate([said, found.error_D_pose[..., 2:]], axis=-1)
         whole = np.concatenate([self.normals, found.error_D_pose[..., 2:]], axis=-1)
@@ -263,11 +279,12 @@ def refine(
     lines = _Lines(window, indices, s)
     poses, extra = np.array(first), np.array(prior.mean[3:])
     covs, has_settled = None, False
-    for _ in range(s.rounds):
-        lines.tie(poses)
+    for number in range(s.rounds):
+        is_late = number >= _FREE_ROUNDS
+        lines.tie(poses, is_late=is_late)
         hessian, slope, weight, change = _system(window, lines, poses, extra, prior, s, covs)
         cov = np.linalg.inv(hessian)
-        step = -cov @ slope
+        step = -(0.5 if is_late else 1.0) * np.linalg.solve(change, slope)
         moved = step[:-2].reshape(-1, 3)
         if not np.all(np.isfinite(step)) or np.abs(moved[:, :2]).max() > 100.0:
             raise SolverError(
@@ -282,15 +299,17 @@ def refine(
     back = np.linalg.inv(change)
     cov = back @ hessian @ back.T  # the errors change by more than what is held to be said
     covs = np.stack([cov[i : i + 3, i : i + 3] for i in range(0, 3 * len(poses), 3)])
+    ahead, bend = lines.road(poses, _HERE_M)
     return Refined(
         poses,
         float(extra[0]),
         float(extra[1]),
-        _with_bends(covs, lines.ahead) if covs is not None else np.zeros((len(poses), 3, 3)),
+        _with_bends(covs, ahead) if covs is not None else np.zeros((len(poses), 3, 3)),
         weight,
         lines.feet,
         has_settled,
-        lines.ahead,
+        ahead,
+        bend,
         _leave_first(window, lines, poses, extra, prior, s, covs),
     )
 

@@ -36,6 +36,12 @@ class Window(FrozenArrays):
         n = len(self.time_s)
         return float(np.clip(n * seen / max(length, 1e-6), 1.0, n))
 
+    @property
+    def stiff(self) -> Array:
+        """(C, m, 2) m, the points in the axes of the last picture, the window being one piece."""
+        poses = self.poses_from(np.zeros(3))[self.picture.astype(int)]
+        return np.stack(in_plane(poses[:, None], self.points), axis=-1)
+
     def poses_from(self, last: Array) -> Array:
         """Return the poses (..., K, 3) of the pictures that end at the poses ``last`` (..., 3)."""
         end = self.motion[-1]

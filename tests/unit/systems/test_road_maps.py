@@ -67,17 +67,37 @@ def lines_of(rng: np.random.Generator) -> list[RoadLine]:
     ]
 
 
-def test_index_is_the_nearest_line() -> None:
-    """Against all pieces of all lines; only where two are as far may the other one be meant."""
-    rng = np.random.default_rng(0)
-    lines = lines_of(rng)
-    points = rng.uniform(-5, 105, (2000, 2))
+def distance_from(lines: list[RoadLine], points: Array) -> Array:
+    """Return the distance (n,) of points (n, 2) from the nearest piece of all, m."""
     best = np.full(len(points), np.inf)
     for line in lines:
         for a, b in zip(line.points[:-1], line.points[1:], strict=True):
             share = np.clip((points - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
             foot = a + share[:, None] * (b - a)
             best = np.minimum(best, np.hypot(*(points - foot).T))
+    return best
+
+
+@pytest.mark.parametrize("piece_m", [0.2, 1.0, 5.0])
+def test_a_foot_on_a_bend_is_the_nearest_place(piece_m: float) -> None:
+    """However short the pieces are: the one next to that of the cell may be nearer."""
+    rng = np.random.default_rng(2)
+    turn = np.arange(0.0, 60.0, piece_m) / 100.0
+    line = RoadLine(
+        "arc", LineKind.LANE_LINE, 100.0 * np.column_stack([np.cos(turn), np.sin(turn)])
+    )
+    at, off = rng.uniform(0.05, 0.5, 500), rng.uniform(98.0, 102.0, 500)
+    points = off[:, None] * np.column_stack([np.cos(at), np.sin(at)])
+    found = LineIndex([line]).foot(points).distance
+    np.testing.assert_allclose(found, distance_from([line], points), atol=1e-9)
+
+
+def test_index_is_the_nearest_line() -> None:
+    """Against all pieces of all lines; only where two are as far may the other one be meant."""
+    rng = np.random.default_rng(0)
+    lines = lines_of(rng)
+    points = rng.uniform(-5, 105, (2000, 2))
+    best = distance_from(lines, points)
     index = LineIndex(lines)
     found = index.foot(points).distance
     near = best < 12.0
