@@ -210,6 +210,17 @@ def messages_flood(eager: Callable[[], DepthLog]) -> Disturb:
     return flood
 
 
+def strange_depths(vessel: Vessel, sent: Sent) -> bool:
+    """Have a client of the same port send false depths with the inertial samples."""
+    if isinstance(sent.message, ImuSample):
+        if not vessel.clients:
+            vessel.clients.append(socket.create_connection(vessel.others.getpeername()))
+        time_s = EPOCH_S + sent.true_s
+        lines = (encode_message(DepthReading(time_s - 1e-4 * k, 20.0)) for k in range(100))
+        vessel.clients[0].sendall(b"".join(lines))
+    return True
+
+
 def deaf_client(vessel: Vessel, sent: Sent) -> bool:
     """Call both outputs once, and never read."""
     if not vessel.clients and sent.true_s >= BEGIN_S:
@@ -271,6 +282,10 @@ FAULTS: Final = {
     "messages at 100 times the rate": SocketFault(
         f"10 000 depths/s more on the socket of the inertial data, {_SPAN}",
         during(messages_flood(eager_depths)), Rule(told="rate_limited", good_after_s=25.0),
+    ),
+    "depths of a stranger": SocketFault(
+        f"10 000 false depths/s from another client at the port of the inertial data, {_SPAN}",
+        during(strange_depths), Rule(told="second_source", good_after_s=5.0),
     ),
     "a client that never reads": SocketFault(
         f"one at each output, from {BEGIN_S:.0f} s on", deaf_client, Rule(good_after_s=5.0),

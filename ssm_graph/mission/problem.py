@@ -22,8 +22,9 @@ from ssm_graph.graph.aids import AIDS
 from ssm_graph.graph.aids.aid import Aid, Keyframes, Table
 from ssm_graph.graph.aids.depth import DEPTH_DRIFT, Depths
 from ssm_graph.graph.aids.gnss import GNSS_DRIFT, Fixes
+from ssm_graph.imu.missing_notes import notes_of_missing
 from ssm_graph.imu.ping_motion import MotionBefore, mean_gyro
-from ssm_graph.imu.preintegration import InertialChain, imu_gaps, preintegrate_steps
+from ssm_graph.imu.preintegration import InertialChain, preintegrate_steps
 from ssm_graph.mission.calibration import (
     CURRENT,
     CURRENTS,
@@ -39,7 +40,7 @@ from ssm_graph.mission.usable import require_usable
 from ssm_graph.sensors.dvl import DvlMount
 from ssm_graph.sensors.dvl_readings import stuck_beams
 from ssm_graph.sensors.frozen import frozen_runs
-from ssm_graph.sensors.imu import ImuLog, frozen_axes
+from ssm_graph.sensors.imu import frozen_axes
 from ssm_graph.sensors.seabed import TerrainLog
 
 SHORTEST_INTERVAL_S = 0.01
@@ -205,7 +206,7 @@ def build_problem_steps(
         aids=tuple(aid for aid in aids if aid is not None),
         notes=(
             *timeline.notes,
-            *_gap_note(mission.imu),
+            *notes_of_missing(mission.imu, timeline.keyframe_s),
             *stuck_note,
             *lost_note,
             *current_note(mission),
@@ -345,18 +346,6 @@ def _repeating(
     sensor: str, what: str, begin_s: float, end_s: float, treatment: Treatment
 ) -> DetectedFault:
     return DetectedFault(sensor, what, begin_s, end_s, chi_sq=np.inf, dof=1, treatment=treatment)
-
-
-def _gap_note(imu: ImuLog) -> tuple[str, ...]:
-    begin, end = imu_gaps(imu)
-    if len(begin) == 0:
-        return ()
-    longest = int(np.argmax(end - begin))
-    return (
-        f"gaps in the inertial data: {len(begin)}, the longest of "
-        f"{end[longest] - begin[longest]:.2f} s at {begin[longest]:.3f} s; bridged with larger "
-        "process noise",
-    )
 
 
 def _fixes(mission: Mission, timeline: Timeline) -> Fixes | None:

@@ -13,6 +13,7 @@ from ssm_graph.base.earth import EARTH_RATE, LocalFrame
 from ssm_graph.base.frozen import Array
 from ssm_graph.graph.gtsam_graph import gtsam_values, inertial_graph
 from ssm_graph.graph.inertial_rows import InertialRows
+from ssm_graph.imu.missing_notes import notes_of_missing
 from ssm_graph.imu.preintegration import (
     GAP_ACCEL,
     GAP_GYRO_RATE,
@@ -85,6 +86,9 @@ def test_many_missing_samples_make_sigmas_grow(share: float) -> None:
     np.testing.assert_allclose(
         sigma[~is_thin], np.broadcast_to(sigma[0], sigma[~is_thin].shape), rtol=0.2
     )
+    notes = notes_of_missing(log, keyframe_s)
+    assert len(notes) == is_thin.any()
+    assert all("10 ms in 4 of 20 steps" in note and "4.000 to 6.000 s" in note for note in notes)
     for k in np.flatnonzero(is_thin):  # on the way, by the interval that was usual before
         near = (log.time_s > keyframe_s[k] - 0.2) & (log.time_s < keyframe_s[k + 1] + 0.2)
         some = ImuLog(

@@ -106,12 +106,12 @@ def test_a_height_is_doubted_where_nothing_else_agrees_with_it() -> None:
     """A fix that agrees speaks against depths that do not, and a depth against fixes."""
     sigma, keyframe = np.full(15, 1e-3), with_beams(100.0)
     low = Watch(last_beam_s=99.0, depths_refused=40)
-    assert doubted(doubt_of(low._replace(last_height_s=69.0), sigma, keyframe)) is Doubted.HEIGHT
-    assert doubt_of(low._replace(last_height_s=71.0), sigma, keyframe) is None
+    assert doubted(doubt_of(low._replace(last_height_s=84.0), sigma, keyframe)) is Doubted.HEIGHT
+    assert doubt_of(low._replace(last_height_s=86.0), sigma, keyframe) is None
     high = Watch(last_beam_s=99.0, heights_refused=5)
-    by_fixes = doubt_of(high._replace(last_depth_s=69.0), sigma, keyframe)
+    by_fixes = doubt_of(high._replace(last_depth_s=84.0), sigma, keyframe)
     assert doubted(by_fixes) is Doubted.HEIGHT_OF_FIXES
-    assert doubt_of(high._replace(last_depth_s=71.0), sigma, keyframe) is None
+    assert doubt_of(high._replace(last_depth_s=86.0), sigma, keyframe) is None
 
 
 def doubted(doubt: Doubt | None) -> Doubted:

@@ -55,7 +55,7 @@ LONGEST_LOCK_OUT_S: Final = 30.0
 """So long the inertial data are believed rather than beams that agree with each other."""
 LOCKED_OUT_FIXES: Final = 5
 LOCKED_OUT_DEPTHS: Final = 25
-VOUCHED_S: Final = 30.0
+VOUCHED_S: Final = 15.0
 """So long a fix or a depth that agreed with the height vouches for it: depths, or fixes, that
 contradict it meanwhile contradict the rest as well, and it does not follow them. Dead reckoning
 alone does not lose a height by their gate within that."""
