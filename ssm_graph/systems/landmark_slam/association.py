@@ -23,8 +23,8 @@ from scipy.optimize import linear_sum_assignment
 from factors.bearing_range import half_turn
 from ssm_graph.base import chi2
 from ssm_graph.base.frozen import Array
+from ssm_graph.systems.landmark_slam.filtered import filter_along
 from ssm_graph.systems.landmark_slam.filters import MapFilter
-from ssm_graph.systems.landmark_slam.methods import FILTERS
 from ssm_graph.systems.landmark_slam.problem import UNKNOWN, SlamNoise, SlamProblem
 
 MOST_LANDMARKS: Final = 400
@@ -90,23 +90,15 @@ def associate(
 ) -> Associated:
     """Return a log with landmarks found by what was seen alone; names it had are not looked at."""
     how = settings or AssociationSettings()
-    slam = FILTERS["ekf-weighted"].begin(
-        problem.motion,
-        noise.control,
-        noise.observation,
-        problem.start[None],
-        capacity=MOST_LANDMARKS,
-        start_cov=np.diag(problem.start_sigma**2),
-    )
+    slam, move = filter_along(problem, noise, "ekf-weighted", capacity=MOST_LANDMARKS)
     assert isinstance(slam, MapFilter)
-    moving = problem.with_drift_as_noise(noise)
     found = np.full(len(problem.keyframe), UNKNOWN, dtype=np.intp)
     pose = np.empty((len(problem.time_s), 3))
     waiting: list[_Provisional] = []
     first = problem.first_of.tolist()
     for k in range(len(pose)):
         if k > 0:
-            slam.predict(moving.control[k - 1][None])
+            move(k)
         rows = np.arange(first[k], first[k + 1])
         rows = rows[np.isfinite(problem.measured[rows]).all(axis=1)]
         if len(rows):
