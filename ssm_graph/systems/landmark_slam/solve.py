@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factors.similarity import Kernel, LogKernel
 from ssm_graph.base.errors import ConfigError, DataError
@@ -54,6 +55,7 @@ from ssm_graph.systems.landmark_slam.problem import (
     SlamProblem,
     SlamStatus,
 )
+from ssm_graph.systems.landmark_slam.reassociation import reassociate
 from ssm_graph.systems.landmark_slam.recorded import (
     VICTORIA_ODOMETRY,
     read_graph,
@@ -239,6 +241,10 @@ def solve(
         named, first = found.problem, Values(found.pose, found.places)
         if np.all(problem.landmark != UNKNOWN):
             errors = association_errors(found.landmark, problem.landmark)
+        if asked.method == "smoother":
+            named, first, again = _associated_again(problem, noise, asked, named, first)
+            if errors is not None:
+                errors = association_errors(again, problem.landmark)
     sigmas: tuple[SigmaFound, ...] = ()
     if asked.method in INCREMENTAL:
         lag_s = asked.lag_s if asked.method == "fixed-lag" else None
@@ -259,6 +265,26 @@ def solve(
             answer = smooth_landmarks(named, noise, values, settings)
     notes = (*notes, *answer.notes)
     return _solved(asked, named, answer, truth, sigmas=sigmas, errors=errors, notes=notes)
+
+
+def _associated_again(
+    problem: SlamProblem, noise: SlamNoise, asked: Asked, named: SlamProblem, first: Values
+) -> tuple[SlamProblem, Values, NDArray[np.intp]]:
+    """Return a log with landmarks by the smoothed path, where it stands, and its landmarks (M,).
+
+    Sigmas are those stated, or, where the noise is learnt, those found if they are larger.
+    """
+    settings, sigma = SmootherSettings(asked.kernel), noise.observation * problem.scales
+    if asked.learns_observations or asked.learns_control:
+        own = learn_observations(named, noise, first, settings)
+        told = own.law.sigmas(np.nan_to_num(problem.measured[:, 0]))
+        sigma, estimate = np.maximum(sigma, told), own.estimate
+    else:
+        estimate = smooth_landmarks(named, noise, first, settings)
+    found = reassociate(problem, sigma, estimate.pose, estimate.landmarks)
+    names = tuple(str(i) for i in range(len(found.places)))
+    values = Values(estimate.pose, found.places, estimate.drift)
+    return problem.associated(found.landmark, names), values, found.landmark
 
 
 def _solved(
