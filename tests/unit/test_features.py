@@ -102,6 +102,7 @@ def test_places_are_found_within_their_sigmas(rate: float) -> None:
     off = places - true_places(sim)
     nees = np.einsum("fi,fij,fj->f", off, np.linalg.inv(cov), off)
     assert_consistent(nees, dof=3)
+    assert estimate.aids is not None
     weights, gross = weights_of(estimate.aids, "feature"), sim.aids.gross["features"]
     assert np.median(weights[~gross]) > 0.7
     if rate:
@@ -129,6 +130,7 @@ def test_a_window_finds_them_as_it_goes() -> None:
     assert reference is not None
     metrics = sg.evaluate(newest.trajectory, reference)
     assert 0.3 < metrics.nees_position < 3.0
+    assert newest.aids is not None
     assert np.median(weights_of(newest.aids, "feature")) > 0.5
 
 

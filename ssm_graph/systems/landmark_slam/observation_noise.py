@@ -56,7 +56,7 @@ FAR: Final = 3.0
 """Sigmas to which residuals are cut where their correlation is taken."""
 
 
-class ObservationLaw(NamedTuple):
+class _Law(NamedTuple):
     """Standard deviations, and how alike successive errors are."""
 
     near_m: float
@@ -86,7 +86,6 @@ class ObservationsFound(NamedTuple):
     estimate: SlamEstimate
     sigmas: tuple[SigmaFound, ...]
     notes: tuple[str, ...]
-    law: ObservationLaw
 
 
 def learn_observations(
@@ -102,7 +101,7 @@ def learn_observations(
     ranges = np.where(there[:, 0], problem.measured[:, 0], 0.0)
     pairs = _successive(problem)
     now, noise, before = problem, stated, given
-    law: ObservationLaw | None = None
+    law: _Law | None = None
     estimate = smooth_landmarks(now, noise, first, how)
     for _ in range(ROUNDS):
         values = Values(estimate.pose, estimate.landmarks, estimate.drift)
@@ -117,7 +116,7 @@ def learn_observations(
         if change < SETTLED_LOG:
             break
     assert law is not None
-    return ObservationsFound(now, estimate, *_told(law, given, ranges, there), law)
+    return ObservationsFound(now, estimate, *_told(law, given, ranges, there))
 
 
 def _with_sigmas(
@@ -146,12 +145,12 @@ def _law(
     ranges: Array,
     there: NDArray[np.bool_],
     pairs: tuple[NDArray[np.intp], NDArray[np.intp]],
-    before: ObservationLaw | None,
-) -> ObservationLaw:
+    before: _Law | None,
+) -> _Law:
     """Return what the expected squares of a pass ask for; ``used`` (M, 2) sigmas whitened it."""
     squares, n_rows = found.expected.own * used**2, found.rows.n_rows
     mean: list[float] = used.mean(axis=0).tolist()
-    law = before or ObservationLaw(mean[0], 0.0, mean[1], np.zeros(2))
+    law = before or _Law(mean[0], 0.0, mean[1], np.zeros(2))
     share = np.array([1.0, *(square_share(_GATED, dim) for dim in (1, 2))])[n_rows.astype(int)]
     own = law.sigmas(ranges) if before else used
     for _ in range(GATINGS):
@@ -165,7 +164,7 @@ def _law(
         if counts[:, 1].sum() >= FEWEST:
             at = counts[:, 1]
             bearing = float(np.sqrt(np.average(squares[at, 1] / share[at], weights=w[at])))
-        law = ObservationLaw(near, part, bearing, np.zeros(2))
+        law = _Law(near, part, bearing, np.zeros(2))
         own = law.sigmas(ranges)
     z = np.clip(found.rows.own_error * used / own, -FAR, FAR)
     alike = np.zeros(2)
@@ -196,7 +195,7 @@ def _growing(squares: Array, ranges: Array, weights: Array) -> tuple[float, floa
 
 
 def _told(
-    law: ObservationLaw, given: Array, ranges: Array, there: NDArray[np.bool_]
+    law: _Law, given: Array, ranges: Array, there: NDArray[np.bool_]
 ) -> tuple[tuple[SigmaFound, ...], tuple[str, ...]]:
     sigmas, notes = [], []
     middle = float(np.median(ranges[there[:, 0]])) if there[:, 0].any() else 0.0

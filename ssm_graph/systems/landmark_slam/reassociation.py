@@ -37,6 +37,8 @@ class Reassociated(NamedTuple):
     """(M,) `UNKNOWN` of those left out."""
     places: Array
     """(L, 2) where the landmarks are, about."""
+    squares: Array
+    """(M,) by which each misses its landmark, in its sigmas; `FITS` of those left out."""
 
 
 def reassociate(problem: SlamProblem, sigma: Array, pose: Array, places: Array) -> Reassociated:
@@ -70,7 +72,9 @@ def reassociate(problem: SlamProblem, sigma: Array, pose: Array, places: Array) 
             break  # all of its heap went to others: the next one would be the same
     stays = np.bincount(found[found >= 0], minlength=len(places)) >= FEWEST_LEFT
     number = np.where(stays, np.cumsum(stays) - 1, UNKNOWN)
-    return Reassociated(np.where(found >= 0, number[found], UNKNOWN), places[stays])
+    squares = np.where(found >= 0, cost[np.arange(len(found)), found], FITS)
+    landmark = np.where(found >= 0, number[found], UNKNOWN)
+    return Reassociated(landmark, places[stays], np.where(landmark >= 0, squares, FITS))
 
 
 class _Seen:

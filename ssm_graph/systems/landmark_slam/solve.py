@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factors.similarity import Kernel, LogKernel
 from ssm_graph.base.errors import ConfigError, DataError
@@ -48,6 +47,7 @@ from ssm_graph.systems.landmark_slam.logs import (
 from ssm_graph.systems.landmark_slam.methods import INCREMENTAL
 from ssm_graph.systems.landmark_slam.noise import SigmaFound, estimate_noise
 from ssm_graph.systems.landmark_slam.observation_noise import learn_observations
+from ssm_graph.systems.landmark_slam.opinions import best_opinion
 from ssm_graph.systems.landmark_slam.problem import (
     UNKNOWN,
     SlamEstimate,
@@ -55,7 +55,6 @@ from ssm_graph.systems.landmark_slam.problem import (
     SlamProblem,
     SlamStatus,
 )
-from ssm_graph.systems.landmark_slam.reassociation import reassociate
 from ssm_graph.systems.landmark_slam.recorded import (
     VICTORIA_ODOMETRY,
     read_graph,
@@ -237,14 +236,16 @@ def solve(
         named = problem.associated(problem.landmark, problem.names)
         first = None
     else:
-        found = associate(problem, noise, AssociationSettings(asked.association))
-        named, first = found.problem, Values(found.pose, found.places)
-        if np.all(problem.landmark != UNKNOWN):
-            errors = association_errors(found.landmark, problem.landmark)
+        how = AssociationSettings(asked.association)
         if asked.method == "smoother":
-            named, first, again = _associated_again(problem, noise, asked, named, first)
-            if errors is not None:
-                errors = association_errors(again, problem.landmark)
+            best = best_opinion(problem, noise, how, SmootherSettings(asked.kernel))
+            named, first, landmark = best[:3]
+        else:
+            found = associate(problem, noise, how)
+            named, first = found.problem, Values(found.pose, found.places)
+            landmark = found.landmark
+        if np.all(problem.landmark != UNKNOWN):
+            errors = association_errors(landmark, problem.landmark)
     sigmas: tuple[SigmaFound, ...] = ()
     if asked.method in INCREMENTAL:
         lag_s = asked.lag_s if asked.method == "fixed-lag" else None
@@ -265,26 +266,6 @@ def solve(
             answer = smooth_landmarks(named, noise, values, settings)
     notes = (*notes, *answer.notes)
     return _solved(asked, named, answer, truth, sigmas=sigmas, errors=errors, notes=notes)
-
-
-def _associated_again(
-    problem: SlamProblem, noise: SlamNoise, asked: Asked, named: SlamProblem, first: Values
-) -> tuple[SlamProblem, Values, NDArray[np.intp]]:
-    """Return a log with landmarks by the smoothed path, where it stands, and its landmarks (M,).
-
-    Sigmas are those stated, or, where the noise is learnt, those found if they are larger.
-    """
-    settings, sigma = SmootherSettings(asked.kernel), noise.observation * problem.scales
-    if asked.learns_observations or asked.learns_control:
-        own = learn_observations(named, noise, first, settings)
-        told = own.law.sigmas(np.nan_to_num(problem.measured[:, 0]))
-        sigma, estimate = np.maximum(sigma, told), own.estimate
-    else:
-        estimate = smooth_landmarks(named, noise, first, settings)
-    found = reassociate(problem, sigma, estimate.pose, estimate.landmarks)
-    names = tuple(str(i) for i in range(len(found.places)))
-    values = Values(estimate.pose, found.places, estimate.drift)
-    return problem.associated(found.landmark, names), values, found.landmark
 
 
 def _solved(
