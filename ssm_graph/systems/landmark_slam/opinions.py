@@ -2,8 +2,8 @@
 
 A filter that goes along cannot take back what it paired wrongly, and a little more or less trust in
 the observations leads it elsewhere. So it goes along several times. Each time the log is smoothed
-and its scans are paired anew along the path; the opinion that explains most with the fewest
-landmarks is taken.
+and its scans are paired anew along the path; the opinion is taken that bends the odometry least and
+explains most, with the fewest landmarks.
 """
 
 from __future__ import annotations
@@ -13,12 +13,17 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.bearing_range import bearing_range_residual
 from ssm_graph.base.frozen import Array
 from ssm_graph.systems.landmark_slam.association import Associated, AssociationSettings, associate
-from ssm_graph.systems.landmark_slam.problem import SlamEstimate, SlamNoise, SlamProblem
+from ssm_graph.systems.landmark_slam.problem import SlamNoise, SlamProblem
 from ssm_graph.systems.landmark_slam.reassociation import Reassociated, reassociate
-from ssm_graph.systems.landmark_slam.smoother import SmootherSettings, Values, smooth_landmarks
+from ssm_graph.systems.landmark_slam.smoother import (
+    Rows,
+    SmootherSettings,
+    Values,
+    linearised,
+    smooth_landmarks,
+)
 
 TRUSTS: Final = ((1.0, 1.0), (1.5, 1.0), (1.0, 1.5))
 """By which the sigmas of ranges and bearings are multiplied while a first opinion is formed."""
@@ -34,7 +39,7 @@ class Opinion(NamedTuple):
     landmark: NDArray[np.intp]
     """(M,) of the log that came, `problem.UNKNOWN` of observations left out"""
     cost: float
-    """Of what is missed and of the landmarks that it takes."""
+    """Of what observations and odometry are missed by, and of the landmarks that it takes."""
 
 
 def best_opinion(
@@ -57,23 +62,20 @@ def _mended(
 ) -> Opinion:
     begin = Values(first.pose, first.places)
     estimate = smooth_landmarks(first.problem, noise, begin, settings)
-    sigma = noise.observation * problem.scales * _more(first.problem, noise, estimate)
+    values = Values(estimate.pose, estimate.landmarks, estimate.drift)
+    rows = linearised(first.problem, noise, values)
+    sigma = noise.observation * problem.scales * _more(rows)
     again = reassociate(problem, sigma, estimate.pose, estimate.landmarks)
     names = tuple(str(i) for i in range(len(again.places)))
-    values = Values(estimate.pose, again.places, estimate.drift)
     named = problem.associated(again.landmark, names)
-    return Opinion(named, values, again.landmark, _cost(again))
+    drift = estimate.drift / problem.drift_sigma if len(estimate.drift) else np.zeros(0)
+    cost = _cost(again) + float(np.sum(rows.between_error**2) + drift @ drift)
+    return Opinion(named, values._replace(landmarks=again.places), again.landmark, cost)
 
 
-def _more(problem: SlamProblem, noise: SlamNoise, estimate: SlamEstimate) -> Array:
+def _more(rows: Rows) -> Array:
     """Return by what (2,) the sigmas are too small, by medians of what is missed; 1 at least."""
-    residual = bearing_range_residual(
-        estimate.pose[problem.keyframe],
-        estimate.landmarks[problem.landmark],
-        measured=problem.measured,
-    )
-    off = np.abs(residual.error) / (noise.observation * problem.scales)
-    return np.maximum(SIGMA_OF_MEDIAN * np.nanmedian(off, axis=0), 1.0)
+    return np.maximum(SIGMA_OF_MEDIAN * np.median(np.abs(rows.own_error), axis=0), 1.0)
 
 
 def _cost(found: Reassociated) -> float:
