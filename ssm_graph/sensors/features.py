@@ -135,6 +135,6 @@ FEATURES: Final = _Features(
     _KEYS,
     (_FEATURE, _RANGE, _BEARING, _ELEVATION),
     FeatureSighting,
-    "f",
+    "p",
     row_key=("feature",),
 )
