@@ -236,12 +236,12 @@ def solve(
         named = problem.associated(problem.landmark, problem.names)
         first = None
     else:
-        how = AssociationSettings(asked.association)
+        pairing = AssociationSettings(asked.association)
         if asked.method == "smoother":
-            best = best_opinion(problem, noise, how, SmootherSettings(asked.kernel))
+            best = best_opinion(problem, noise, pairing, SmootherSettings(asked.kernel))
             named, first, landmark = best[:3]
         else:
-            found = associate(problem, noise, how)
+            found = associate(problem, noise, pairing)
             named, first = found.problem, Values(found.pose, found.places)
             landmark = found.landmark
         if np.all(problem.landmark != UNKNOWN):
