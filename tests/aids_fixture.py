@@ -79,5 +79,5 @@ def with_every_aid(**changes: Any) -> SimulatedMission:
 def weights_of(table: AidTable, name: str) -> Array:
     """Return the weight (M,) of each measurement of an aid, of three components or of one."""
     weight = table.weight[np.array(table.aid) == name]
-    step = 3 if name in ("GNSS", "USBL", "standstill", "magnetometer") else 1
+    step = 3 if name in ("GNSS", "USBL", "standstill", "magnetometer", "feature") else 1
     return np.asarray(weight[::step])

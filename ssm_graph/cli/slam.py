@@ -32,7 +32,7 @@ INPUT is a folder with landmarks.toml (docs/landmark-slam.md), a folder of the U
 rows (Victoria Park in GTSAM's examples). Relations of poses that meet again are weighed too.
 
 files in DIR:
-  path.csv        pose and sigmas wherever something was seen
+  path.csv        pose and sigmas where something was seen, and every second between
   landmarks.csv   places, sigmas, how often seen
   weights.csv     every observation with its weight
   summary.json    what was asked for, noise used and found, errors where there is a truth

@@ -23,6 +23,7 @@ from ssm_graph.engine.states import NavigationStates, States
 from ssm_graph.graph.aids.aid import RowStates
 from ssm_graph.graph.beacon_start import find_beacons
 from ssm_graph.graph.beam_rows import BeamRows, linearize_beams
+from ssm_graph.graph.feature_start import find_features
 from ssm_graph.graph.first_weights import met_weights, settle_weights, updated_trust
 from ssm_graph.graph.forward_pass import AidsOfKeyframe, ForwardAids, ForwardExtras
 from ssm_graph.graph.inertial_rows import InertialRows
@@ -157,6 +158,7 @@ class _ForwardPass:
         if self.extras:
             states = states._replace(walks=columns[4], constants=self.extras.constants)
         states, met = find_beacons(states, self.aids, problem.extras, self.met.weights)
+        states, met = find_features(states, self.aids, problem.extras, met)
         return FirstValues(states, self.weights, self.n_doubts, met)
 
     def _predict(self, k: int) -> None:

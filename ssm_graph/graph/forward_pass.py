@@ -4,7 +4,8 @@ The aids of a keyframe meet the prediction together, as beams do, for one of the
 met one after the other, a gross one that an uncertain prediction lets pass would have all later
 ones refused. What a prediction and its covariance cannot mean starts without weight; the smoother,
 which knows the whole mission, judges again. Ranges to a beacon whose place is unknown are left to
-:mod:`ssm_graph.graph.beacon_start`: their linearisation there would mean nothing.
+:mod:`ssm_graph.graph.beacon_start`, as their linearisation there would mean nothing, and sightings
+of features to :mod:`ssm_graph.graph.feature_start`.
 """
 
 from __future__ import annotations
@@ -19,7 +20,6 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.graph.aids.aid import Aid, RowStates
 from ssm_graph.graph.aids.depth import DepthMeans
 from ssm_graph.graph.aids.gnss import Fixes
-from ssm_graph.graph.aids.ranges import Ranges
 from ssm_graph.graph.beam_rows import BeamRows, CalibratedBeams, PreparedBeams
 from ssm_graph.graph.first_weights import GATE, settled_weights
 from ssm_graph.graph.measurements import Measurements
@@ -59,9 +59,9 @@ class ForwardAids:
         self._at: dict[int, list[tuple[Aid, int]]] = {}
         number = 0
         for aid in aids.all:
-            is_unknown = ~aid.is_known[aid.beacon] if isinstance(aid, Ranges) else None
+            waits = aid.waits
             for i, k in enumerate(aid.keyframe.tolist()):
-                if is_unknown is None or not is_unknown[i]:
+                if waits is None or not waits[i]:
                     self._at.setdefault(k, []).append((aid.take(slice(i, i + 1)), number))
                 number += 1
 

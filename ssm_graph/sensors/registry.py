@@ -9,6 +9,7 @@ from ssm_graph.sensors.acoustic import RANGES, USBL
 from ssm_graph.sensors.compass import COMPASS
 from ssm_graph.sensors.depth import DEPTH
 from ssm_graph.sensors.dvl_instrument import DVL
+from ssm_graph.sensors.features import FEATURES
 from ssm_graph.sensors.gnss import GNSS
 from ssm_graph.sensors.imu import IMU
 from ssm_graph.sensors.instrument import Instrument
@@ -25,6 +26,7 @@ INSTRUMENTS: Final[tuple[Instrument, ...]] = (
     RANGES,
     COMPASS,
     MAGNETOMETER,
+    FEATURES,
     AT_REST,
 )
 """In the order in which a folder has their tables, and a log counts them."""

@@ -28,6 +28,7 @@ from ssm_graph.sensors.acoustic import AcousticRange, UsblFix
 from ssm_graph.sensors.compass import HeadingReading
 from ssm_graph.sensors.depth import DepthReading
 from ssm_graph.sensors.dvl import Ping
+from ssm_graph.sensors.features import FeatureSighting
 from ssm_graph.sensors.gnss import Fix
 from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.magnetometer import MagneticReading
@@ -84,6 +85,8 @@ LINES = {
     "heading": '{"type": "heading", "time_s": 6, "heading_deg": 90}',
     "magnetometer": '{"type": "magnetometer", "time_s": 7, "mag_ut": [20, -5, 44]}',
     "at_rest": '{"type": "at_rest", "time_s": 8, "sigma_m_per_s": 0.1}',
+    "features": '{"type": "features", "time_s": 9, "feature": 2, "range_m": 12.5, '
+    '"bearing_deg": -30, "elevation_deg": -20}',
 }
 
 
@@ -117,7 +120,9 @@ def test_all_kinds_of_message_have_a_schema() -> None:
 def test_lines_of_the_documentation() -> None:
     """Written by hand: integers are numbers, null is a missing beam, degrees become radians."""
     messages, refused = decode("\n".join([*LINES.values(), ""]).encode())
-    imu, ping, depth, fix, acoustic, reach, heading, magnetic, rest = messages
+    imu, ping, depth, fix, acoustic, reach, heading, magnetic, rest, sight = messages
+    assert isinstance(sight, FeatureSighting)
+    assert (sight.bearing, sight.elevation) == pytest.approx(np.radians([-30.0, -20.0]))
     assert imu == ImuSample(1.0, (1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
     assert isinstance(ping, Ping)
     assert ping == Ping(1.5, (0.1, math.nan, -0.3, 0.4))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from ssm_graph.graph.aids.aid import Aid
+from ssm_graph.graph.aids.features import FeatureSightings
 from ssm_graph.graph.aids.heading import Headings
 from ssm_graph.graph.aids.magnetometer import MagneticFields
 from ssm_graph.graph.aids.ranges import Ranges
@@ -19,4 +20,5 @@ AIDS: Final[tuple[type[Aid], ...]] = (
     Standstills,
     MagneticFields,
     TerrainRanges,
+    FeatureSightings,
 )

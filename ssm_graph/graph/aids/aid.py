@@ -181,6 +181,11 @@ class Aid(Table, ABC):
         return cls.name, np.zeros(0)
 
     @property
+    def waits(self) -> NDArray[np.bool_] | None:
+        """(M,) of what nobody knows the place of: a first pass leaves it to a search along it."""
+        return None
+
+    @property
     @abstractmethod
     def root_information(self) -> Array:
         """(M, d, d) whitens the errors."""

@@ -119,6 +119,11 @@ class Ranges(Aid):
         return "range", np.zeros(0) if log is None else log.time_s
 
     @property
+    def waits(self) -> NDArray[np.bool_]:
+        """(M,) those to beacons whose place is not known."""
+        return ~self.is_known[self.beacon]
+
+    @property
     def root_information(self) -> Array:
         """(M, 1, 1) 1/m."""
         return np.asarray(1.0 / self.sigma[:, None, None])

@@ -1,8 +1,11 @@
 """Which landmark was seen, where nobody says: gates, joint compatibility, provisional landmarks.
 
 A filter goes along; what it expects of the landmarks near, with their covariances, is held against
-each scan. What fits none and is far from all begins a provisional landmark, which joins the map
-once it was seen often enough; what is near one but does not fit is left out.
+each scan. A pair has to tell more than chance: the density of the observation where the landmark is
+expected, over that of landmarks that were not met yet. After a stretch in which nothing was seen,
+heading and place are so uncertain that any landmark fits, and then none is believed. What fits none
+and is far from all, or near those alone that could tell nothing, begins a provisional landmark,
+which joins the map once it was seen often enough; what is near one but does not fit is left out.
 
 References
 ----------
@@ -23,12 +26,16 @@ from scipy.optimize import linear_sum_assignment
 from factors.bearing_range import half_turn
 from ssm_graph.base import chi2
 from ssm_graph.base.frozen import Array
+from ssm_graph.systems.landmark_slam.filtered import filter_along
 from ssm_graph.systems.landmark_slam.filters import MapFilter
-from ssm_graph.systems.landmark_slam.methods import FILTERS
 from ssm_graph.systems.landmark_slam.problem import UNKNOWN, SlamNoise, SlamProblem
 
 MOST_LANDMARKS: Final = 400
 """That a log may give rise to."""
+FEWEST_DENSE: Final = 3
+MARGIN_M: Final = 1.0
+SMALLEST_M2: Final = 20.0
+"""Landmarks, m and m^2 from which a density is taken seriously: a first one alone tells none."""
 MOST_IN_SCAN: Final = 12
 """Observations whose combinations are tried; of more, the nearest are taken."""
 
@@ -50,14 +57,17 @@ class AssociationSettings:
     """Share of true pairs that pass."""
     is_new: float = 1.0 - 1e-9
     """What no landmark can have been at this confidence may be a new one."""
+    tells: float = 1.0
+    """Logarithm of the odds for a perfect fit, below which a landmark cannot be told from one that
+    was not met yet."""
     sightings: int = 3
     """After which a provisional landmark joins the map."""
-    provisional_m: float = 0.3
+    provisional_m: float = 0.2
     """Sightings of a provisional landmark lie so near each other ..."""
     provisional_share: float = 0.05
     """... or nearer than this share of the range."""
-    provisional_poses: int = 200
-    """Poses after which one that did not join is forgotten."""
+    provisional_s: float = 5.0
+    """After which one that was not seen again is forgotten."""
     near_m: float = 20.0
     """Landmarks farther from where an observation would put its own are no candidates."""
 
@@ -90,23 +100,15 @@ def associate(
 ) -> Associated:
     """Return a log with landmarks found by what was seen alone; names it had are not looked at."""
     how = settings or AssociationSettings()
-    slam = FILTERS["ekf-weighted"].begin(
-        problem.motion,
-        noise.control,
-        noise.observation,
-        problem.start[None],
-        capacity=MOST_LANDMARKS,
-        start_cov=np.diag(problem.start_sigma**2),
-    )
+    slam, move = filter_along(problem, noise, "ekf-weighted", capacity=MOST_LANDMARKS)
     assert isinstance(slam, MapFilter)
-    moving = problem.with_drift_as_noise(noise)
     found = np.full(len(problem.keyframe), UNKNOWN, dtype=np.intp)
     pose = np.empty((len(problem.time_s), 3))
     waiting: list[_Provisional] = []
     first = problem.first_of.tolist()
     for k in range(len(pose)):
         if k > 0:
-            slam.predict(moving.control[k - 1][None])
+            move(k)
         rows = np.arange(first[k], first[k + 1])
         rows = rows[np.isfinite(problem.measured[rows]).all(axis=1)]
         if len(rows):
@@ -155,13 +157,24 @@ def _paired(
     own = np.stack([inner[0, 2 * i : 2 * i + 2, 2 * i : 2 * i + 2] for i in range(len(near))])
     S = own[None] + R[:, None]
     nis = np.einsum("mli,mli->ml", nu, np.linalg.solve(S, nu[..., None])[..., 0])
-    fresh = [int(rows[i]) for i in np.flatnonzero(nis.min(axis=1) > chi2.ppf(how.is_new, 2))]
+    per_m2 = _density(slam.landmarks()[0])
+    best_odds = -0.5 * np.log(np.linalg.det(2.0 * np.pi * S)) - np.log(per_m2 * z[:, :1])
+    near_it = nis < chi2.ppf(how.is_new, 2)
+    is_new = ~np.any(near_it & (best_odds > how.tells), axis=1)
     limit = float(chi2.ppf(how.fits, 2))
+    nis = np.where(best_odds - 0.5 * nis > 0.0, nis, np.inf)
     if how.kind is Association.NEAREST:
         chosen = _nearest(nis, limit)
     else:
         chosen = _joint(nu, nis, inner[0], R, limit, how.fits)
-    return [(int(rows[i]), names[j]) for i, j in chosen], fresh
+    is_new[[i for i, _ in chosen]] = False
+    return [(int(rows[i]), names[j]) for i, j in chosen], rows[is_new].tolist()
+
+
+def _density(places: Array) -> float:
+    """Return landmarks per m^2 in the box of those that there are, with a margin."""
+    extent = np.prod(np.ptp(places, axis=0) + MARGIN_M)
+    return float(max(len(places), FEWEST_DENSE) / max(extent, SMALLEST_M2))
 
 
 def _nearest(nis: Array, limit: float) -> list[tuple[int, int]]:
@@ -221,7 +234,8 @@ def _sighted(
     how: AssociationSettings,
 ) -> list[tuple[int, int]]:
     """Take what may be new; return the pairs of landmarks that join the map now."""
-    waiting[:] = [one for one in waiting if k - one.last <= how.provisional_poses]
+    now = problem.time_s[k]
+    waiting[:] = [one for one in waiting if now - problem.time_s[one.last] < how.provisional_s]
     joined: list[tuple[int, int]] = []
     if not fresh:
         return joined

@@ -134,7 +134,7 @@ class MapFilter:
         self._mean = np.zeros((runs, most))
         self._cov = np.zeros((runs, most, most))
         self._mean[:, :POSE], self._cov[:, :POSE, :POSE] = start, start_cov
-        self._n = POSE
+        self._n, self._first_place = POSE, POSE
         self._slot: dict[int, int] = {}
         self._refused = np.zeros((runs, capacity), dtype=np.intp)
         self.n_repaired = 0
@@ -171,7 +171,7 @@ class MapFilter:
 
     def landmarks(self) -> Array:
         """Return the places (B, L, 2) of all landmarks, in the order of `ids`."""
-        return self.mean[:, POSE:].reshape(len(self._mean), -1, 2)
+        return self.mean[:, self._first_place :].reshape(len(self._mean), -1, 2)
 
     def predict(self, control: Array) -> None:
         """Move by controls (B, c)."""
@@ -206,7 +206,7 @@ class MapFilter:
         return seen.predicted.reshape(len(seen.inner), -1, 2), seen.inner
 
     def _states(self, ids: Sequence[int]) -> NDArray[np.intp]:
-        first = POSE + 2 * np.array([self._slot[name] for name in ids], dtype=np.intp)
+        first = self._first_place + 2 * np.array([self._slot[name] for name in ids], dtype=np.intp)
         return (first[:, None] + np.arange(2)).ravel()
 
     def _correct(
@@ -372,7 +372,7 @@ class MapFilter:
     def _name(self, ids: Sequence[int], places: Array) -> None:
         begin, m = self._n, len(ids)
         self._mean[:, begin : begin + 2 * m] = places.reshape(len(places), -1)
-        self._slot |= {name: (begin - POSE) // 2 + i for i, name in enumerate(ids)}
+        self._slot |= {name: (begin - self._first_place) // 2 + i for i, name in enumerate(ids)}
         self._n += 2 * m
 
 

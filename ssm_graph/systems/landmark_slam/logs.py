@@ -1,7 +1,7 @@
 """Logs of real vehicles: speeds and turn rates, observed landmarks, and truth where there is any.
 
-Poses stand where something was observed. Between them the odometry is integrated as it came, each
-speed until the next.
+Poses stand where something was observed, and between where that lasts: what is wrong with a heading
+displaces all that follows it. The odometry is integrated as it came, each speed until the next.
 """
 
 from __future__ import annotations
@@ -20,6 +20,9 @@ from ssm_graph.systems.landmark_slam.problem import UNKNOWN, SlamEstimate, SlamN
 
 SAME_TIME_S: Final = 0.01
 """Observations closer than this in time share a pose."""
+LONGEST_STEP_S: Final = 1.0
+"""From a pose to the next. Within a step errors of turn and of distance are taken for independent:
+at 0.04 rad/sqrt(s) that leaves out 0.02 of the way, less than such odometry is worth."""
 TRUTH_GAP_S: Final = 0.2
 """Nearer than this to samples on both sides the truth is interpolated."""
 STANDSTILL: Final = 0.05
@@ -136,12 +139,10 @@ def problem_of_log(log: LandmarkLog, *, start: Array | None = None) -> SlamProbl
         )
     seen_s, seen, landmark = log.seen_s[within], log.seen[within], log.landmark[within]
     is_new = np.append(True, np.diff(seen_s) > SAME_TIME_S)
-    keyframe = np.cumsum(is_new) - 1
-    time_s = seen_s[is_new]
+    time_s, at = _filled(seen_s[is_new])
+    keyframe = at[np.cumsum(is_new) - 1]
     steps = increments(log, time_s)
-    span = np.sqrt(np.diff(time_s))[:, None]
-    still = np.all(steps == 0.0, axis=1, keepdims=True)
-    control = np.hstack([steps, np.repeat(np.where(still, STANDSTILL, 1.0) * span, 3, axis=1)])
+    control = np.hstack([steps, np.repeat(_noise_scale(log, time_s)[:, None], 3, axis=1)])
     names = np.unique(landmark[landmark != UNKNOWN])
     index = np.where(landmark == UNKNOWN, UNKNOWN, np.searchsorted(names, landmark))
     first = start
@@ -161,6 +162,21 @@ def problem_of_log(log: LandmarkLog, *, start: Array | None = None) -> SlamProbl
         np.array(DRIFT_SIGMA),
         np.column_stack([seen[:, 0], np.ones(len(seen))]) if log.range_sigma_grows else None,
     )
+
+
+def _filled(time_s: Array) -> tuple[Array, NDArray[np.intp]]:
+    """Return times with as many between as the longest step asks for, and where they went."""
+    parts = np.maximum(np.ceil(np.diff(time_s) / LONGEST_STEP_S), 1.0).astype(np.intp)
+    at = np.append(0, np.cumsum(parts))
+    return np.interp(np.arange(at[-1] + 1), at, time_s), at
+
+
+def _noise_scale(log: LandmarkLog, time_s: Array) -> Array:
+    """Return roots (K - 1,) of the seconds of each step; those at rest count as less."""
+    still = (log.turn_rate == 0.0) & np.all(log.speed == 0.0, axis=1)
+    dt = np.diff(log.odometry_s) * np.where(still[:-1], STANDSTILL**2, 1.0)
+    total = np.interp(time_s, log.odometry_s, np.append(0.0, np.cumsum(dt)))
+    return np.asarray(np.sqrt(np.diff(total)))
 
 
 def increments(log: LandmarkLog, time_s: Array) -> Array:

@@ -19,6 +19,7 @@ from ssm_graph.filters.rules.noise_adaptive import (
     StatedNoise,
     VariationalBayes,
 )
+from ssm_graph.systems.landmark_slam.drifting_filter import DriftingFilter
 from ssm_graph.systems.landmark_slam.filters import Gate, MapFilter, SlamFilter
 from ssm_graph.systems.landmark_slam.models import Motion
 from ssm_graph.systems.landmark_slam.other_filters import (
@@ -43,12 +44,19 @@ class FilterMethod:
     is_told: bool = False
     """Told the true sigmas, biases as noise."""
 
+    @property
+    def follows_drift(self) -> bool:
+        """Whether the odometry's constant errors are states."""
+        return self.make is DriftingFilter
+
     def begin(
         self, motion: Motion, control: Array, observation: Array, start: Array, **more: Any
     ) -> SlamFilter:
         """Return a filter at its start; sigmas (q,) and (2,), poses (B, 3)."""
         noise = self.law.begin(control, observation, len(start))
         given = {"start_cov": np.zeros((3, 3)), "robust": self.robust, **more}
+        if self.follows_drift:
+            given.setdefault("drift_sigma", np.zeros(0))
         return self.make(motion, noise, start, **given)
 
 
@@ -77,7 +85,9 @@ FILTERS: Final[Mapping[str, FilterMethod]] = {
     "ukf-full": FilterMethod("unscented filter, points of the whole state", FullUnscentedFilter),
     "ekf-gate": FilterMethod("extended filter behind a gate", robust=Gate()),
     "ekf-weighted": FilterMethod(
-        "extended filter, a similarity weight for each observation", robust=LogKernel(5.0)
+        "extended filter, a similarity weight for each observation, drift of the odometry a state",
+        DriftingFilter,
+        robust=LogKernel(5.0),
     ),
     "invariant-weighted": FilterMethod(
         "right-invariant filter with similarity weights", InvariantFilter, robust=LogKernel(5.0)

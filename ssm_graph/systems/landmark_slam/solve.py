@@ -47,6 +47,7 @@ from ssm_graph.systems.landmark_slam.logs import (
 from ssm_graph.systems.landmark_slam.methods import INCREMENTAL
 from ssm_graph.systems.landmark_slam.noise import SigmaFound, estimate_noise
 from ssm_graph.systems.landmark_slam.observation_noise import learn_observations
+from ssm_graph.systems.landmark_slam.opinions import best_opinion
 from ssm_graph.systems.landmark_slam.problem import (
     UNKNOWN,
     SlamEstimate,
@@ -235,10 +236,16 @@ def solve(
         named = problem.associated(problem.landmark, problem.names)
         first = None
     else:
-        found = associate(problem, noise, AssociationSettings(asked.association))
-        named, first = found.problem, Values(found.pose, found.places)
+        pairing = AssociationSettings(asked.association)
+        if asked.method == "smoother":
+            best = best_opinion(problem, noise, pairing, SmootherSettings(asked.kernel))
+            named, first, landmark = best[:3]
+        else:
+            found = associate(problem, noise, pairing)
+            named, first = found.problem, Values(found.pose, found.places)
+            landmark = found.landmark
         if np.all(problem.landmark != UNKNOWN):
-            errors = association_errors(found.landmark, problem.landmark)
+            errors = association_errors(landmark, problem.landmark)
     sigmas: tuple[SigmaFound, ...] = ()
     if asked.method in INCREMENTAL:
         lag_s = asked.lag_s if asked.method == "fixed-lag" else None

@@ -1,0 +1,134 @@
+"""Landmarks without names after a blind stretch, in pairs; poses in gaps; drift as a state."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ssm_graph.base.frozen import Array
+from ssm_graph.systems.landmark_slam.association import (
+    Association,
+    associate,
+    association_errors,
+)
+from ssm_graph.systems.landmark_slam.filtered import filtered
+from ssm_graph.systems.landmark_slam.logs import LONGEST_STEP_S, LandmarkLog, problem_of_log
+from ssm_graph.systems.landmark_slam.problem import UNKNOWN, SlamNoise
+from ssm_graph.systems.landmark_slam.reassociation import reassociate
+from ssm_graph.systems.landmark_slam.solve import Asked, solve
+
+STEP_S = 0.1
+SIGMA = np.array([0.05, 0.01])
+
+
+def drive(
+    places: Array, *, seen_s: tuple[tuple[float, float], ...], wrong: float = 0.0, seed: int = 0
+) -> LandmarkLog:
+    """Return circles of 2.5 m for 120 s that see what lies ahead within 5 m, at some times alone.
+
+    The odometry's turn rate is ``wrong`` rad/s too large all along.
+    """
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, 120.0, STEP_S)
+    heading = 0.2 * t
+    truth = np.column_stack([2.5 * np.sin(heading), 2.5 * (1.0 - np.cos(heading)), heading])
+    times, seen, names = [], [], []
+    for at in range(0, len(t), 5):
+        if not any(begin <= t[at] < end for begin, end in seen_s):
+            continue
+        d = places - truth[at, :2]
+        z = np.column_stack([np.hypot(*d.T), np.arctan2(d[:, 1], d[:, 0]) - heading[at]])
+        z[:, 1] = (z[:, 1] + np.pi) % (2.0 * np.pi) - np.pi
+        view = np.flatnonzero((z[:, 0] < 5.0) & (np.abs(z[:, 1]) < 1.2))
+        seen.append(z[view] + SIGMA * rng.standard_normal((len(view), 2)))
+        times += [t[at]] * len(view)
+        names += view.tolist()
+    speed = np.column_stack([0.5 + 0.02 * rng.standard_normal(len(t)), np.zeros(len(t))])
+    return LandmarkLog(
+        t,
+        speed,
+        0.2 + wrong + 0.06 * rng.standard_normal(len(t)),
+        np.array(times),
+        np.concatenate(seen),
+        np.array(names),
+        SlamNoise(np.array([0.02, 0.01, 0.02]), SIGMA),
+        t,
+        truth,
+    )
+
+
+RING = np.array([[4.0, 2.5], [1.0, 6.0], [-4.0, 4.0], [-3.0, -0.5], [1.5, -2.0]])
+
+
+def test_poses_stand_in_gaps() -> None:
+    """A second apart at most; what was seen keeps its times."""
+    log = drive(RING, seen_s=((0.0, 10.0), (60.3, 70.0)))
+    problem = problem_of_log(log)
+    assert np.diff(problem.time_s).max() <= LONGEST_STEP_S
+    assert problem.time_s[problem.keyframe] == pytest.approx(log.seen_s)
+    assert np.sum(problem.control[:, 3] ** 2) == pytest.approx(np.ptp(problem.time_s))
+    # Where it stands still the same time is worth less noise.
+    still = replace(log, speed=np.zeros_like(log.speed), turn_rate=np.zeros_like(log.turn_rate))
+    assert problem_of_log(still).control[:, 3].max() < 0.06
+
+
+def test_what_odometry_is_wrong_by_becomes_known() -> None:
+    """A turn rate that is 0.03 rad/s too large, and the path with it as good as without."""
+    names_known = []
+    for wrong in (0.0, 0.03):
+        log = drive(RING, seen_s=((0.0, 40.0), (70.0, 120.0)), wrong=wrong)
+        answer = filtered(problem_of_log(log), log.noise, "ekf-weighted")
+        turn = answer.drift[2] + answer.drift[1] * (0.2 + wrong)
+        assert turn == pytest.approx(-wrong, abs=0.004)
+        problem = problem_of_log(log)
+        true = np.column_stack([np.interp(problem.time_s, log.truth_s, x) for x in log.truth.T])
+        names_known.append(np.sqrt(np.mean(np.sum((answer.pose - true)[:, :2] ** 2, axis=1))))
+    assert names_known[1] < 3.0 * names_known[0] + 0.1
+
+
+def test_after_a_blind_stretch_no_landmark_is_believed_at_once() -> None:
+    """What is seen then stands where nothing was mapped, and is not taken for what was."""
+    places = np.array([[4.0, 2.5], [1.0, 6.0], [-4.0, 4.0], [-3.0, -0.5]])
+    log = drive(places, seen_s=((0.0, 4.0), (40.0, 44.0)), wrong=0.02)
+    before = log.landmark[log.seen_s < 20.0]
+    after = np.setdiff1d(log.landmark[log.seen_s > 20.0], before)
+    assert len(after) > 0
+    problem = problem_of_log(log)
+    # Odometry that leaves heading and place open by 0.6 rad and a metre.
+    found = associate(problem, SlamNoise(np.array([0.1, 0.1, 0.1]), SIGMA))
+    is_new = np.isin(log.landmark, after)
+    old = np.unique(found.landmark[(log.seen_s < 20.0) & (found.landmark != UNKNOWN)])
+    taken = np.isin(found.landmark[is_new], old)
+    assert not taken.any()
+
+
+def test_leftovers_become_landmarks() -> None:
+    """A first opinion that has one landmark in the place of two, and none in that of a third."""
+    pair = np.vstack([RING, RING[0] + [0.3, 0.3]])
+    log = drive(pair, seen_s=((0.0, 120.0),))
+    problem = problem_of_log(log)
+    true = np.column_stack([np.interp(problem.time_s, log.truth_s, x) for x in log.truth.T])
+    sigma = log.noise.observation * problem.scales
+    first = np.delete(pair, [3, 5], axis=0)
+    again = reassociate(problem, sigma, true, first)
+    errors = association_errors(again.landmark, problem.landmark)
+    assert len(again.places) == len(pair)
+    assert errors.n_split == 0
+    assert errors.n_wrong < 0.02 * errors.n
+    assert errors.n_left_out < 0.02 * errors.n
+
+
+def test_unnamed_is_nearly_as_good_as_named() -> None:
+    """A log with a blind stretch and a turn rate that is wrong, through all stages."""
+    log = drive(RING, seen_s=((0.0, 40.0), (70.0, 120.0)), wrong=0.01, seed=1)
+    problem = problem_of_log(log)
+    true = np.column_stack([np.interp(problem.time_s, log.truth_s, x) for x in log.truth.T])
+    named, unnamed = (
+        solve(problem, log.noise, Asked(association=kind), truth=true).score
+        for kind in (Association.KNOWN, Association.JOINT)
+    )
+    assert named is not None
+    assert unnamed is not None
+    assert unnamed.aligned_m < 1.2 * named.aligned_m + 0.01
