@@ -17,11 +17,14 @@ from ssm_graph.systems.visual_ranges.bundle import FurtherTerms
 from ssm_graph.systems.visual_ranges.bundle_metric import BundleMetric
 from ssm_graph.systems.visual_ranges.bundle_ranges import BundleRanges
 from ssm_graph.systems.visual_ranges.loop_closing import Step
+from ssm_graph.systems.visual_ranges.range_fit import places_of
+from ssm_graph.systems.visual_ranges.range_rows import known_spacing, of_anchors
 from ssm_graph.systems.visual_ranges.range_terms import FramePoses
 from ssm_graph.systems.visual_ranges.ranges import Ranges
 from ssm_graph.systems.visual_ranges.ranging import Ranging, RangingResult
 from ssm_graph.systems.visual_ranges.ranging_result import VehicleResult
 from ssm_graph.systems.visual_ranges.start import StartRules, StartState
+from ssm_graph.systems.visual_ranges.two_scales import OwnScale, contradiction
 from ssm_graph.systems.visual_ranges.vehicle import Vehicle
 from ssm_graph.systems.visual_ranges.vehicle_terms import (
     MetricState,
@@ -59,6 +62,7 @@ class Metric:
         self.state: MetricState | None = None
         self.started_s = float("nan")
         self._history: list[tuple[float, float, float]] = []
+        self._poses: tuple[Array, Array] | None = None
         self._own_share = vehicle.scale_share
         self.link = max(float(np.hypot(self._own_share, vehicle.range_scale_share)), LEAST_LINK)
 
@@ -102,6 +106,7 @@ class Metric:
         R_cw, t_cw, time_s : (K, 3, 3), (K, 3) and (K,) of the key frames.
         """
         told, prior = [], None
+        self._poses = (R_cw, t_cw)
         if self.vehicle.has_aids:
             self.terms, was_aided = hung(self.vehicle, time_s), self.is_aided
             self.state = metric_state(self.terms, R_cw, t_cw)
@@ -232,4 +237,28 @@ class Metric:
             self._own_sigma,
             float(self.ranging.scale / np.exp(log_scale)) if has_both else float("nan"),
             float(np.hypot(told.sigma_log_scale, self._own_sigma)) if has_both else float("nan"),
+            self._contradiction() if has_both else "",
+        )
+
+    def _contradiction(self) -> str:
+        """Return what speaks against both scales being one, asked of the ranges alone."""
+        assert self.state is not None
+        ranging = self.ranging
+        if ranging.terms is None or self._poses is None:
+            return ""
+        places = places_of(ranging.terms, *self._poses, ranging.ranges.time_s)
+        used = np.array(ranging.used)
+        own, _ = of_anchors(places, used)
+        lost_s = np.array([ranging.anchors[j].lost_s for j in ranging.used])
+        own = own.rows(np.flatnonzero(own.time_s < lost_s[own.anchor]))
+        return contradiction(
+            own,
+            tuple(ranging.anchors[j].name for j in ranging.used),
+            OwnScale(
+                "depth sensor" if self.vehicle.dead_reckoning is None else "dead reckoning (DVL)",
+                self.state.log_scale,
+                float(np.hypot(self._own_sigma, self.vehicle.range_scale_share)),
+            ),
+            self.rules,
+            spacing=known_spacing(ranging.ranges.known_position, used),
         )

@@ -54,6 +54,8 @@ class VehicleResult(ReadOnlyArrays):
     range_unit: float
     """Unit of the ranges in metres: assumed over true sound speed; NaN without ranges."""
     range_unit_sigma: float
+    contradiction: str
+    """What speaks against this scale and that of the ranges being one; "" where nothing does."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

@@ -158,7 +158,7 @@ def test_an_answer_by_the_vehicle_alone(tmp_path: Path) -> None:
     sequence, result = made()
     none, own = np.zeros(0), result.ranging
     told = VehicleResult(
-        np.array([0.0, 0.8, 0.6]), 1e-6 * np.eye(2), 3.0, SCALE, 0.004, np.nan, np.nan
+        np.array([0.0, 0.8, 0.6]), 1e-6 * np.eye(2), 3.0, SCALE, 0.004, np.nan, np.nan, ""
     )
     own = replace(
         own, anchors=(), error_m=none, weight=none, anchor_of=np.zeros(0, np.intp), vehicle=told
@@ -177,6 +177,9 @@ def test_an_answer_by_the_vehicle_alone(tmp_path: Path) -> None:
     assert answer["vehicle"]["down_map_axes"] == [0.0, 0.8, 0.6]
     assert answer["vehicle"]["range_unit_m"] is None
     assert any("down is 0.000, 0.800, 0.600" in line for line in lines(result, found, off))
+    doubted = replace(own, vehicle=replace(told, contradiction="the DVL against anchor A"))
+    found = judged(replace(result, ranging=doubted))
+    assert (found.verdict, found.reasons) == (Verdict.DOUBTFUL, ("the DVL against anchor A",))
     own = replace(own, state=StartState.WITHOUT_RANGES, reasons=("residuals of A",))
     found = judged(replace(result, ranging=own))
     assert found.verdict is Verdict.DOUBTFUL
