@@ -46,6 +46,7 @@ files in DIR:
   map.npz          the map, for --in-map
   result.json      verdict, reasons, notes, errors where there is a truth
   report.html      all of it in words, tables and figures
+  recording.rrd    with --recording: map, path, images and ranges for the viewer of rerun
 
 With --in-map, only trajectory.tum: where in an earlier map each image was taken. The exit code is
 0 where the map is in metres and more than half of the images were found, 4 else.
@@ -89,6 +90,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--threads", action="store_true", help="map beside tracking: faster, not bit for bit"
     )
+    parser.add_argument(
+        "--recording", action="store_true", help="write recording.rrd, for the viewer of rerun, too"
+    )
     parser.set_defaults(run=run)
 
 
@@ -100,8 +104,11 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     from ssm_graph.systems.visual_ranges.page import write_page
     from ssm_graph.systems.visual_ranges.readers.images import WatchedImages
     from ssm_graph.systems.visual_ranges.readers.source import read_sequence
+    from ssm_graph.systems.visual_ranges.recording import RECORDING_NAME, rerun, write_recording
     from ssm_graph.systems.visual_ranges.verdict import judged
 
+    if arguments.recording:
+        rerun()  # said before the work, not after it
     check_is_free(arguments.out, may_overwrite=arguments.overwrite)
     sequence = read_sequence(arguments.recording, _options(arguments))
     if arguments.no_ranges:
@@ -120,6 +127,8 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     figures = write_figures(arguments.out, sequence, result, found, off)
     page = arguments.out / "report.html"
     write_page(page, sequence, result, found, off, figures, defects)
+    if arguments.recording:
+        write_recording(arguments.out / RECORDING_NAME, sequence, result)
     for line in lines(result, found, off):
         say(console, line)
     say(console, f"results in {arguments.out}, report in {page}")

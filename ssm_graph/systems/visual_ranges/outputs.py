@@ -173,6 +173,7 @@ def summary_of(
                 "relative_sigma": _plain(own.sigma_log_scale),
                 "range_unit_m": _plain(own.range_unit),
                 "range_unit_sigma": _plain(own.range_unit_sigma),
+                "contradiction": own.contradiction,
             }
     if errors is not None:
         found["against_truth"] = {

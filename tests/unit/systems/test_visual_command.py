@@ -20,6 +20,7 @@ from ssm_graph.systems.visual_ranges.path_file import PathAsItComes
 from ssm_graph.systems.visual_ranges.ranges import screened_ranges
 from ssm_graph.systems.visual_ranges.ranging import Anchor, AnchorState, RangingResult
 from ssm_graph.systems.visual_ranges.ranging_result import VehicleResult
+from ssm_graph.systems.visual_ranges.recording import write_recording
 from ssm_graph.systems.visual_ranges.result import FrameNow, FrameState, MapSnapshot, VisualResult
 from ssm_graph.systems.visual_ranges.sequence import PathTruth, Sequence
 from ssm_graph.systems.visual_ranges.similarity3 import Sim3
@@ -151,6 +152,21 @@ def test_files_of_an_answer(tmp_path: Path) -> None:
     assert summary["verdict"] == "READY"
     assert summary["notes"] == ["a note", "images: 1 are black: 7"]
     assert summary["against_truth"]["anchor_error_m"] == [pytest.approx(0.3)]
+
+
+def test_a_recording_for_rerun(tmp_path: Path) -> None:
+    """What the viewer is given: every pose, the key frames' images, anchors, ranges, events."""
+    reader = pytest.importorskip("rerun.chunk").RrdReader
+    sequence, result = made()
+    write_recording(tmp_path / "recording.rrd", sequence, result)
+    chunks: dict[str, int] = {}
+    for chunk in reader(tmp_path / "recording.rrd").stream().to_chunks():
+        name = str(chunk.entity_path)
+        chunks[name] = chunks.get(name, 0) + chunk.num_rows
+    assert chunks["/map/camera"] == N + 1
+    assert chunks["/map/camera/image"] == len(result.map.image)
+    assert chunks["/ranges/weight/A"] == N
+    assert {"/map/points", "/map/path", "/map/anchors/A", "/events"} <= set(chunks)
 
 
 def test_an_answer_by_the_vehicle_alone(tmp_path: Path) -> None:
