@@ -124,6 +124,9 @@ RUNS: Final[Mapping[str, int]] = {
     "kitchen-mono": 1,
     "kitchen-1": 5,
     "kitchen-3": 5,
+    "kitti-1-arm": 5,
+    "kitchen-1-arm": 5,
+    "kitchen-3-arm": 5,
     "room": 5,
     "room-nlos": 20,
     "room-half": 20,
@@ -167,6 +170,13 @@ GOALS: Final[tuple[Goal, ...]] = (
         ("kitti-1",), "called MIRROR, %", percent_called("kitti-1", ("MIRROR",)), 100.0,
         is_least=True,
     ),
+    *_accuracy("kitti-1-arm", 0.45, 0.7, 0.0),
+    Goal(
+        ("kitti-1-arm",), "called MIRROR, %", percent_called("kitti-1-arm", ("MIRROR",)), 100.0,
+        is_least=True,
+    ),
+    *_accuracy("kitchen-1-arm", 0.08, 4.0, 0.0),
+    *_accuracy("kitchen-3-arm", 0.06, 2.5, 0.0),
     Goal(("room-nlos",), "scale, %, rms", root_mean_square("room-nlos", "scale", factor=100), 1.0),
     Goal(("room-nlos",), "scale, %, worst", worst("room-nlos", "scale", factor=100.0), 2.5),
     Goal(

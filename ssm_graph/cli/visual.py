@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -78,6 +79,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--lever-arm-m", nargs=3, type=float, metavar=("X", "Y", "Z"), help="camera to antenna"
     )
+    number_option(
+        parser, "--lever-arm-sigma-m", "M", "of each of its numbers: above 0 it is found as well"
+    )
     number_option(parser, "--rate-hz", "HZ", "of images that carry no times")
     number_option(parser, "--start-s", "S", "time of the first image on the clock of the ranges")
     number_option(parser, "--first", "N", "first image that is used", 0, kind=int)
@@ -113,6 +117,8 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     sequence = read_sequence(arguments.recording, _options(arguments))
     if arguments.no_ranges:
         sequence = _without_ranges(sequence)
+    if arguments.lever_arm_sigma_m is not None:
+        sequence = replace(sequence, lever_arm_sigma_m=arguments.lever_arm_sigma_m)
     for note in sequence.notes:
         say(errors, f"note: {note}")
     if arguments.in_map is not None:
@@ -153,8 +159,6 @@ def _options(arguments: argparse.Namespace) -> ReadOptions:
 
 
 def _without_ranges(sequence: Sequence) -> Sequence:
-    from dataclasses import replace
-
     from ssm_graph.systems.visual_ranges.ranges import screened_ranges
 
     return replace(sequence, ranges=screened_ranges([], [], []))
@@ -271,6 +275,9 @@ def lines(result: VisualResult, found: Judged, off: Accuracy | None) -> list[str
                 f"{anchor.bias_m:+.2f} m; {100 * anchor.nlos_share:.0f} % of {anchor.n_ranges} "
                 "ranges not believed"
             )
+        if ranging.lever_error_m.any():
+            change = ", ".join(f"{x:+.3f}" for x in ranging.lever_error_m)
+            told.append(f"  the lever arm is off by {change} m, camera axes")
         own = ranging.vehicle
         if own is not None:
             down = ", ".join(f"{x:.3f}" for x in own.down)

@@ -17,7 +17,6 @@ from ssm_graph.systems.visual_ranges.bundle import FurtherTerms
 from ssm_graph.systems.visual_ranges.bundle_metric import BundleMetric
 from ssm_graph.systems.visual_ranges.bundle_ranges import BundleRanges
 from ssm_graph.systems.visual_ranges.loop_closing import Step
-from ssm_graph.systems.visual_ranges.range_fit import places_of
 from ssm_graph.systems.visual_ranges.range_rows import known_spacing, of_anchors
 from ssm_graph.systems.visual_ranges.range_terms import FramePoses
 from ssm_graph.systems.visual_ranges.ranges import Ranges
@@ -48,16 +47,18 @@ class Metric:
         lever_arm_m: Array,
         vehicle: Vehicle = Vehicle(),  # noqa: B008
         rules: StartRules | None = None,
+        lever_sigma_m: float = 0.0,
     ) -> None:
         """Take all that was measured; only what is before the newest frame is used.
 
         Parameters
         ----------
         lever_arm_m : (3,) camera to the ranges' antenna, camera axes.
+        lever_sigma_m : standard deviation of each of its numbers; above 0 it is found as well.
         """
         self.vehicle = vehicle
         self.rules = StartRules() if rules is None else rules
-        self.ranging = Ranging(ranges, lever_arm_m, self.rules)
+        self.ranging = Ranging(ranges, lever_arm_m, self.rules, lever_sigma_m)
         self.terms: VehicleTerms | None = None
         self.state: MetricState | None = None
         self.started_s = float("nan")
@@ -246,7 +247,7 @@ class Metric:
         ranging = self.ranging
         if ranging.terms is None or self._poses is None:
             return ""
-        places = places_of(ranging.terms, *self._poses, ranging.ranges.time_s)
+        places = ranging.places(*self._poses)
         used = np.array(ranging.used)
         own, _ = of_anchors(places, used)
         lost_s = np.array([ranging.anchors[j].lost_s for j in ranging.used])

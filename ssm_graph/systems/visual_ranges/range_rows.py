@@ -16,11 +16,19 @@ from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, POLISH
 
 def plain_errors(at: Places, found: Solution) -> tuple[Array, Array]:
     """Return errors (M,), m, and weights (M,) of ranges at a solution, without modes."""
+    at = with_arm(at, found)
     camera = at.camera + found.clock_s * at.velocity
     line = found.scale * camera + at.lever + found.clock_s * at.lever_rate
     error = np.linalg.norm(line - found.anchors[at.anchor], axis=1) + found.biases[at.anchor]
     error = error - at.range_m
     return error, POLISH.weight(error, 0.0, at.sigma_m)
+
+
+def with_arm(at: Places, found: Solution) -> Places:
+    """Return places by the lever arm that was found, exact from now on."""
+    if at.arm is None or found.arm is None:
+        return at
+    return at._replace(lever=at.lever + at.arm @ found.arm, arm=None)
 
 
 def is_sharp(found: Solution, rules: StartRules, at: Places, i: int) -> bool:

@@ -80,13 +80,22 @@ class RangeTerms(ReadOnlyArrays):
     """(M,)"""
     sigma_m: Array
     """(M,)"""
+    axes: Array | None = None
+    """(M, 3, 3) of the camera there, key frame axes; None where no lever arm is to be found"""
 
     def __len__(self) -> int:
         return len(self.range_m)
 
     def rows(self, kept: NDArray[np.bool_] | Indices) -> RangeTerms:
         """Return some of them."""
-        return RangeTerms(*(getattr(self, name)[kept] for name in self.__dataclass_fields__))
+        columns = (getattr(self, name) for name in self.__dataclass_fields__)
+        return RangeTerms(*(None if column is None else column[kept] for column in columns))
+
+    def with_lever(self, change_m: Array) -> RangeTerms:
+        """Return the same with a lever arm that is longer by (3,), camera axes, m."""
+        if self.axes is None:
+            return self
+        return replace(self, lever=self.lever + self.axes @ change_m)
 
     def on(self, pose: Indices) -> RangeTerms:
         """Return the same on key frames counted otherwise: (M,) of each."""
@@ -183,4 +192,5 @@ def hang(
         lever_rate=np.einsum("mij,mj->mi", R_kc, np.cross(turn / span[:, None], arm)),
         range_m=ranges.range_m[row],
         sigma_m=ranges.sigma_m[row],
+        axes=R_kc,
     )

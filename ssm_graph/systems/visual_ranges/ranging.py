@@ -31,6 +31,7 @@ from ssm_graph.systems.visual_ranges.range_rows import (
     lost_since,
     of_anchors,
     plain_errors,
+    with_arm,
 )
 from ssm_graph.systems.visual_ranges.range_terms import FramePoses, RangeTerms, hang
 from ssm_graph.systems.visual_ranges.ranges import Indices, Ranges
@@ -73,14 +74,22 @@ class _Own(NamedTuple):
 class Ranging:
     """The ranges of a run."""
 
-    def __init__(self, ranges: Ranges, lever_arm_m: Array, rules: StartRules | None = None) -> None:
+    def __init__(
+        self,
+        ranges: Ranges,
+        lever_arm_m: Array,
+        rules: StartRules | None = None,
+        lever_sigma_m: float = 0.0,
+    ) -> None:
         """Take all ranges of the run; only those before the newest frame are used.
 
         Parameters
         ----------
         lever_arm_m : (3,) camera to antenna, camera axes.
+        lever_sigma_m : standard deviation of each of its numbers; above 0 it is found as well.
         """
         self.ranges, self.lever_arm_m = ranges, np.asarray(lever_arm_m, dtype=np.float64)
+        self.lever_sigma_m = lever_sigma_m
         self.rules = StartRules() if rules is None else rules
         self.anchor: Indices = ranges.anchor.copy()
         self.anchors = [_Own(name) for name in ranges.names]
@@ -125,7 +134,7 @@ class Ranging:
         self.terms = replace(self.terms, anchor=self.anchor[self.terms.row])
         if not len(self.terms):
             return []
-        places = places_of(self.terms, R_cw, t_cw, self.ranges.time_s)
+        places = self.places(R_cw, t_cw)
         now = float(places.time_s[-1])
         if self.found is None:
             if len(places.time_s) < TRY_AGAIN * self._tried:
@@ -137,6 +146,17 @@ class Ranging:
         if self.found is not None:
             self.history.append((now, self.found.scale, self.found.sigma_log_scale))
         return told
+
+    def places(self, R_cw: Array, t_cw: Array) -> Places:
+        """Return where the antenna was at each range, by the key frames' poses."""
+        assert self.terms is not None
+        return places_of(self.terms, R_cw, t_cw, self.ranges.time_s, self.lever_sigma_m)
+
+    @property
+    def lever_error_m(self) -> Array:
+        """(3,) what the lever arm is off by, camera axes, as far as ranges tell."""
+        arm = None if self.found is None else self.found.arm
+        return np.zeros(3) if arm is None else self.lever_sigma_m * arm
 
     def restart(self) -> None:
         """Forget scale and anchors: the map's scale has changed. The next update starts anew."""
@@ -155,24 +175,19 @@ class Ranging:
             return None
         column = np.full(len(self.anchors), -1, dtype=np.intp)
         column[self.used] = np.arange(len(self.used))
-        doubtful = [own.state is AnchorState.DOUBTFUL for own in self.anchors]
-        column[doubtful] = -1
+        column[[own.state is AnchorState.DOUBTFUL for own in self.anchors]] = -1
         known = pose_of[np.minimum(self.terms.key_frame, len(pose_of) - 1)]
         known = np.where(self.terms.key_frame < len(pose_of), known, -1)
         kept = (known >= 0) & (column[self.terms.anchor] >= 0)
         if not kept.any():
             return None
-        own = self.terms.rows(kept)
+        own = self.terms.rows(kept).with_lever(self.lever_error_m)
         return BundleRanges(
-            replace(own, anchor=column[own.anchor]),
-            known[kept],
-            self.found.scale,
-            self.found.clock_s,
-            self.found.anchors,
-            self.found.biases,
+            replace(own, anchor=column[own.anchor]), known[kept],
+            self.found.scale, self.found.clock_s, self.found.anchors, self.found.biases,
             POLISH,  # what is far too long would bend biases and anchors otherwise
             is_free,
-        )
+        )  # fmt: skip
 
     def adopt(self, extra: Array, covariance: Array, further: BundleRanges) -> None:
         """Take over what an adjustment with free scale and anchors found, (E,) and (E, E).
@@ -201,20 +216,16 @@ class Ranging:
             if found.sigma_log_scale > self.rules.ready_sigma:
                 state = StartState.COARSE
         return RangingResult(
-            state,
-            self.scale,
-            found.sigma_log_scale if found is not None else float("nan"),
+            state, self.scale, found.sigma_log_scale if found is not None else float("nan"),
             found.clock_s if found is not None else 0.0,
             float(np.sqrt(found.covariance[1, 1])) if found is not None else float("nan"),
             tuple(self._shown(j) for j in range(len(self.anchors))),
-            self.error.copy(),
-            self.weight.copy(),
-            self.anchor.copy(),
+            self.error.copy(), self.weight.copy(), self.anchor.copy(),
             np.array(self.history).reshape(-1, 3),
             () if self.start is None else self.start.reasons,
             "" if self.start is None else self.start.advice,
-            self.started_s,
-        )
+            self.started_s, lever_error_m=self.lever_error_m,
+        )  # fmt: skip
 
     def _shown(self, j: int) -> Anchor:
         own, found = self.anchors[j], self.found
@@ -223,21 +234,14 @@ class Ranging:
         if found is not None and j in self.used:
             i = self.used.index(j)
             place, covariance = found.anchors[i].copy(), found.anchor_covariance(i).copy()
-            bias, sigma = (
-                float(found.biases[i]),
-                float(np.sqrt(found.covariance[5 + 4 * i, 5 + 4 * i])),
-            )
+            square = found.covariance[5 + 4 * i, 5 + 4 * i]
+            bias, sigma = float(found.biases[i]), float(np.sqrt(square))
         return Anchor(
-            own.name,
-            own.state,
-            place,
-            covariance,
-            bias,
-            float(sigma),
+            own.name, own.state, place, covariance, bias, float(sigma),
             np.array([where for where, _ in own.alternatives]).reshape(-1, 3),
             int((self.anchor == j).sum()),
             float(np.mean(weight < NLOS_WEIGHT)) if len(weight) else float("nan"),
-        )
+        )  # fmt: skip
 
     def _start(self, places: Places, turned_rad: float) -> list[str]:
         """Try to find scale and the anchors that have ranges enough."""
@@ -353,10 +357,8 @@ class Ranging:
             lost_s = np.inf
             marked = weight[recent] < NLOS_WEIGHT
             if recent.sum() >= LEAST_RECENT and float(np.mean(marked)) > DOUBTFUL_SHARE:
-                state, lost_s = (
-                    AnchorState.DOUBTFUL,
-                    min(own.lost_s, lost_since(self.ranges.time_s, self.anchor == j, self.weight)),
-                )
+                since = lost_since(self.ranges.time_s, self.anchor == j, self.weight)
+                state, lost_s = AnchorState.DOUBTFUL, min(own.lost_s, since)
             if own.state is not state:
                 told.append(f"anchor {own.name}: {state.value}")
             self._set(j, state=state, lost_s=lost_s)
@@ -407,7 +409,7 @@ class Ranging:
     def _placed(self, own: Places) -> tuple[Array, float, Array] | None:
         """Return place, bias and covariance (4, 4) of an anchor, if its ranges tell them."""
         assert self.found is not None
-        own = own._replace(anchor=np.zeros(len(own.anchor), dtype=np.intp))
+        own = with_arm(own._replace(anchor=np.zeros(len(own.anchor), dtype=np.intp)), self.found)
         problem = problem_of(own, 1, self.rules.kernel, drift=0.0, bias_walk_m=0.0)
         found = later_anchor(problem, float(np.log(self.found.scale)), self.rules)
         where, covariance, _ = found[0]

@@ -210,7 +210,7 @@ def _alone(problem: Problem, j: int) -> Problem:
     """Return the problem of one anchor, without modes."""
     own = np.flatnonzero(problem.places.anchor == j)
     places = problem.places.rows(own)
-    places = places._replace(anchor=np.zeros(len(own), dtype=np.intp))
+    places = places._replace(anchor=np.zeros(len(own), dtype=np.intp), arm=None)
     none = np.zeros((len(own), 0))
     return replace(problem, places=places, n_anchors=1, drift=none, walk=none, spacing=())
 

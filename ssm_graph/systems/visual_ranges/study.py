@@ -78,15 +78,18 @@ class Recorded:
     """Least and largest distance of an anchor from the middle of the path, level."""
     height_m: tuple[float, float]
     """The same upwards; cameras are level at first, so up is -y."""
+    lever_sigma_m: float = 0.0
+    """Of the place, beside the camera, that the truth is of and ranges are simulated from."""
 
 
 NLOS: Final = RangeFaults(nlos_share=0.3)
 HALF: Final = RangeFaults(nlos_share=0.5)
 _KITCHEN: Final = ("kitchen", (1.5, 3.0), (0.5, 1.5))
 _KITTI: Final = ("kitti07", (30.0, 60.0), (4.0, 8.0))
-RECORDED: Final[Mapping[str, Recorded]] = {
+_ANCHORS: Final = ("no ranges", "one anchor", "", "three anchors")
+_RECORDED: Final[Mapping[str, Recorded]] = {
     f"{name}-{n}" if n else f"{name}-mono": Recorded(
-        f"{words}, {('no ranges', 'one anchor', '', 'three anchors')[n]}", place[0], n, *place[1:]
+        f"{words}, {_ANCHORS[n]}", place[0], n, *place[1:]
     )
     for name, words, place in (
         ("kitchen", "7-Scenes kitchen", _KITCHEN),
@@ -94,7 +97,16 @@ RECORDED: Final[Mapping[str, Recorded]] = {
     )
     for n in (0, 1, 3)
 }
-"""By name."""
+RECORDED: Final[Mapping[str, Recorded]] = _RECORDED | {
+    f"{name}-arm": replace(
+        _RECORDED[name],
+        about=f"{_RECORDED[name].about}, lever arm to be found",
+        lever_sigma_m=sigma,
+    )
+    for name, sigma in (("kitchen-1", 0.05), ("kitchen-3", 0.05), ("kitti-1", 0.5))
+}
+"""By name; with ``-arm`` what the truth is a path of, from which ranges are simulated, is not taken
+for the camera: it may be elsewhere on the car, or on the sensor in the hand."""
 CASES: Final[Mapping[str, Case]] = {
     "room": Case("room, one anchor", Run("room")),
     "room-mono": Case("room, no ranges", Run("room"), has_ranges=False),
@@ -244,6 +256,7 @@ def recorded(case: Recorded, seed: int, duration_s: float = 0.0) -> Sequence:
     middle = 0.5 * (path.min(axis=0) + path.max(axis=0))
     anchors = middle + np.stack([away * np.cos(turn), -up, away * np.sin(turn)], axis=1)
     sequence = with_simulated_ranges(sequence, anchors, seed)
+    sequence = replace(sequence, lever_arm_sigma_m=case.lever_sigma_m)
     if not duration_s:
         return sequence
     kept = sequence.time_s < sequence.time_s[0] + duration_s

@@ -78,7 +78,9 @@ class _Run:
         self.metric = None
         if len(sequence.ranges) or sequence.vehicle.has_aids:
             lever = np.array(sequence.lever_arm_m)
-            self.metric = Metric(sequence.ranges, lever, sequence.vehicle)
+            self.metric = Metric(
+                sequence.ranges, lever, sequence.vehicle, lever_sigma_m=sequence.lever_arm_sigma_m
+            )
         self.loops = LoopFinder(self.camera, settings.loops)
         self.pool = None if settings.is_deterministic else ThreadPoolExecutor(1)
         self.job: tuple[Image, Tracks, Future[Tracks]] | None = None

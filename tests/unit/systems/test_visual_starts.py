@@ -87,6 +87,7 @@ def test_the_fit_has_the_right_derivatives() -> None:
     a, b, c, d = rng.normal(size=(4, n, 3))
     time = np.sort(rng.uniform(0.0, 30.0, n))
     places = Places(a, b, c, d, np.arange(n) % 2, rng.uniform(1, 5, n), np.full(n, 0.1), time)
+    places = places._replace(arm=0.3 * rng.normal(size=(n, 3, 3)))
     problem = problem_of(places, 2, RangeKernel(), drift=0.05, bias_walk_m=0.1)
     at = 0.3 * rng.normal(size=(2, problem.n_unknowns))
     _, J = residuals(problem, at)
@@ -151,6 +152,30 @@ def test_hung_ranges_fit_the_true_path() -> None:
     assert float(np.abs(found.error).max()) < 2e-3
     off = terms.linearise(R, t, UNIT_M, anchors=anchors, biases=np.zeros(2))
     assert float(np.abs(off.error).max()) > 2e-2
+
+
+def test_a_lever_arm_that_is_not_known_is_found() -> None:
+    """Taken as exact it bends the scale; found with the rest it is right within its sigma."""
+    arm = np.array([0.3, -0.1, 0.2])
+    faults = RangeFaults(lever_arm_m=(0.3, -0.1, 0.2))
+    made, frames, anchors = true_run(Run("room", 20, 30.0, texel_m=0.05, ranges=faults))
+    found = Ranging(made.ranges, np.zeros(3), lever_sigma_m=0.3)
+    until(found, frames, 30.0)
+    result = found.result()
+    assert result.has_scale
+    assert abs(np.log(result.scale / UNIT_M)) < 3.0 * result.sigma_log_scale < 0.05
+    assert np.linalg.norm(result.lever_error_m - arm) < 0.15
+    assert np.linalg.norm(result.anchors[0].place_m - anchors[0]) < 0.3
+    exact = Ranging(made.ranges, np.zeros(3))
+    until(exact, frames, 30.0)
+    assert not exact.result().lever_error_m.any()
+    assert abs(np.log(exact.scale / result.scale)) > 0.02
+    poses = np.arange(len(frames.R_cw[:601:5]))
+    moved, plain = found.further(poses), exact.further(poses)
+    assert moved is not None
+    assert plain is not None
+    rows = moved.rows(frames.R_cw[:601:5], frames.t_cw[:601:5], np.zeros(0)).error
+    assert np.median(np.abs(rows)) < 1.5
 
 
 def test_all_places_of_an_anchor_judge_a_loop() -> None:
