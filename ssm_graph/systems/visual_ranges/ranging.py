@@ -30,8 +30,8 @@ from ssm_graph.systems.visual_ranges.range_rows import (
     largest_turn,
     lost_since,
     of_anchors,
+    placed_later,
     plain_errors,
-    with_arm,
 )
 from ssm_graph.systems.visual_ranges.range_terms import FramePoses, RangeTerms, hang
 from ssm_graph.systems.visual_ranges.ranges import Indices, Ranges
@@ -41,9 +41,9 @@ from ssm_graph.systems.visual_ranges.start import (
     StartRules,
     StartState,
     find_start,
-    later_anchor,
+    moved,
 )
-from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, POLISH, robust_rms
+from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, POLISH
 from ssm_graph.systems.visual_ranges.widening import widened
 
 __all__ = ["Anchor", "AnchorState", "Ranging", "RangingResult"]
@@ -157,6 +157,10 @@ class Ranging:
         """(3,) what the lever arm is off by, camera axes, as far as ranges tell."""
         arm = None if self.found is None else self.found.arm
         return np.zeros(3) if arm is None else self.lever_sigma_m * arm
+
+    def check_again(self) -> None:
+        """Have the next update search everywhere, however few ranges have come since it did."""
+        self._checked = 0
 
     def restart(self) -> None:
         """Forget scale and anchors: the map's scale has changed. The next update starts anew."""
@@ -331,6 +335,12 @@ class Ranging:
             told = [f"scale {'doubted' if self.is_refused else 'believed again'}: {what}"]
         if best is None:
             return told
+        # A place that is as good by now was not there, or was left, when there were fewer ranges.
+        for i, j in enumerate(self.used):
+            known, others = self.anchors[j].alternatives, (best, *again.alternatives)
+            fresh = [one for one in others if moved(self.found, one, i)]
+            found = [(one.anchors[i].copy(), float(one.biases[i])) for one in fresh]
+            self._set(j, alternatives=(*known, *found))
         other = unknowns_of(problem, best.scale, best.anchors, best.biases, best.clock_s)
         fit = search(problem, np.array([self.found.unknowns, other]))
         if fit.cost[1] < fit.cost[0] - self.rules.gap:
@@ -381,13 +391,15 @@ class Ranging:
         for unknowns, cost in zip(fit.unknowns, fit.cost, strict=True):
             one = unknowns[2 + 4 * i : 6 + 4 * i]
             place = one[:3] + np.exp(unknowns[0]) * problem.middle
-            apart = float(np.linalg.norm(place - found.anchors[i])) > SAME_PLACE_M
-            if apart and cost < least + self.rules.gap:
+            taken = np.array([found.anchors[i], *(other for other, _ in kept)])
+            is_new = float(np.linalg.norm(taken - place, axis=1).min()) > SAME_PLACE_M
+            if is_new and cost < least + self.rules.gap:
                 kept.append((place, float(one[3])))
         self._set(self.used[i], alternatives=(*kept,))
 
     def _later(self, places: Places) -> list[str]:
         """Place anchors that have ranges enough by now, and anew those that seem to have moved."""
+        assert self.found is not None
         told = []
         for j in range(len(self.anchors)):
             own, unused = self.anchors[j], j not in self.used
@@ -400,36 +412,18 @@ class Ranging:
                 continue
             if float(np.ptp(places.time_s[rows])) < self.rules.least_s:
                 continue
-            placed = self._placed(places.rows(rows))
+            placed = placed_later(places.rows(rows), self.found, self.rules)
             if placed is None:
                 continue
             told.append(self._take(j, *placed, since))
         return told
 
-    def _placed(self, own: Places) -> tuple[Array, float, Array] | None:
-        """Return place, bias and covariance (4, 4) of an anchor, if its ranges tell them."""
-        assert self.found is not None
-        own = with_arm(own._replace(anchor=np.zeros(len(own.anchor), dtype=np.intp)), self.found)
-        problem = problem_of(own, 1, self.rules.kernel, drift=0.0, bias_walk_m=0.0)
-        found = later_anchor(problem, float(np.log(self.found.scale)), self.rules)
-        where, covariance, _ = found[0]
-        limit = self.rules.anchor_sigma_share * float(np.median(own.range_m))
-        limit = max(self.rules.anchor_sigma_m, limit)
-        if len(found) > 1 or float(np.sqrt(np.trace(covariance[:3, :3]))) > limit:
-            return None
-        place = where[:3] + self.found.scale * problem.middle
-        line = self.found.scale * own.camera + own.lever - place
-        error = np.linalg.norm(line, axis=1) + where[3] - own.range_m
-        if robust_rms(error) > self.rules.rms_sigmas * float(np.median(own.sigma_m)):
-            return None
-        return place, float(where[3]), covariance
-
     def _take(self, j: int, place: Array, bias: float, covariance: Array, since: float) -> str:
         """Take an anchor into use; one that moved becomes another from some time on."""
         assert self.found is not None
         name = self.anchors[j].name
-        moved = bool(np.isfinite(since))
-        if moved:
+        has_moved = bool(np.isfinite(since))
+        if has_moved:
             recent = (self.anchor == j) & (self.ranges.time_s >= since)
             self.anchors.append(_Own(f"{name} from {since:.1f} s"))
             self.anchor[recent] = len(self.anchors) - 1
@@ -447,4 +441,4 @@ class Ranging:
             biases=np.append(found.biases, bias),
             covariance=wider,
         )
-        return f"anchor {name} " + ("has moved: placed anew" if moved else "placed")
+        return f"anchor {name} " + ("has moved: placed anew" if has_moved else "placed")

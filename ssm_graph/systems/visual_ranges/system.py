@@ -107,6 +107,8 @@ class _Run:
             self.pool.shutdown()
         if self.settings.has_final_adjustment and self.world.n_frames > 2:
             with self.timed("last adjustment"):
+                if self.metric is not None:
+                    self.metric.ranging.check_again()
                 self.adjust_all()
                 self.follow_back()
                 self.refine_frames()

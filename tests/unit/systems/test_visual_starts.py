@@ -24,7 +24,7 @@ from ssm_graph.systems.visual_ranges.range_fit import (
 )
 from ssm_graph.systems.visual_ranges.range_rows import known_spacing
 from ssm_graph.systems.visual_ranges.range_terms import FramePoses, RangeTerms, hang
-from ssm_graph.systems.visual_ranges.ranges import Ranges
+from ssm_graph.systems.visual_ranges.ranges import Ranges, screened_ranges
 from ssm_graph.systems.visual_ranges.ranging import Ranging
 from ssm_graph.systems.visual_ranges.ranging_result import AnchorState
 from ssm_graph.systems.visual_ranges.readers.starloc import read_starloc
@@ -176,6 +176,31 @@ def test_a_lever_arm_that_is_not_known_is_found() -> None:
     assert plain is not None
     rows = moved.rows(frames.R_cw[:601:5], frames.t_cw[:601:5], np.zeros(0)).error
     assert np.median(np.abs(rows)) < 1.5
+
+
+def test_a_place_that_is_as_good_is_found_again_at_the_end() -> None:
+    """A path in a plane: the anchor's mirror image, once lost, is listed when all is searched."""
+    time = np.arange(0.0, 20.0, 0.1)
+    place = np.stack([3 * np.sin(time / 3), 2 * np.sin(time / 2), np.zeros_like(time)], 1)
+    anchor, noise = np.array([2.0, 1.0, 1.5]), 0.05 * np.random.default_rng(1).normal(size=200)
+    measured = np.linalg.norm(place - anchor, axis=1) + noise
+    ranges = screened_ranges(time + 0.01, ["A"] * 200, measured, np.full(200, 0.05))
+    eye = np.broadcast_to(np.eye(3), (200, 3, 3)).copy()
+    frames = FramePoses(time, eye, -place / UNIT_M, np.arange(200) // 5)
+    ranging = Ranging(ranges, np.zeros(3))
+    until(ranging, frames, 20.0)
+    assert ranging.result().anchors[0].state is AnchorState.AMBIGUOUS
+    ranging.anchors[0] = ranging.anchors[0]._replace(state=AnchorState.READY, alternatives=())
+    until(ranging, frames, 20.0)
+    assert not len(ranging.result().anchors[0].alternatives_m)
+    ranging.check_again()
+    until(ranging, frames, 20.0)
+    (found,) = ranging.result().anchors
+    assert found.state is AnchorState.AMBIGUOUS
+    places = np.array([found.place_m, *found.alternatives_m])
+    assert len(places) == 2
+    for z in (1.5, -1.5):
+        assert np.linalg.norm(places - [2.0, 1.0, z], axis=1).min() < 0.3
 
 
 def test_all_places_of_an_anchor_judge_a_loop() -> None:
