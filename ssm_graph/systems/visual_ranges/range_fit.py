@@ -69,7 +69,7 @@ class Places(NamedTuple):
 
     def rows(self, kept: Indices) -> Places:
         """Return some of them."""
-        return Places(*(None if column is None else column[kept] for column in self))
+        return Places._make(None if column is None else column[kept] for column in self)
 
 
 def places_of(

@@ -13,7 +13,7 @@ further. Jacobians are of the left perturbation ``T_cw = Exp(rho, phi) T_cw``.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,8 +88,12 @@ class RangeTerms(ReadOnlyArrays):
 
     def rows(self, kept: NDArray[np.bool_] | Indices) -> RangeTerms:
         """Return some of them."""
-        columns = (getattr(self, name) for name in self.__dataclass_fields__)
-        return RangeTerms(*(None if column is None else column[kept] for column in columns))
+        kept_of: dict[str, Any] = {
+            name: None if column is None else column[kept]
+            for name in self.__dataclass_fields__
+            for column in [getattr(self, name)]
+        }
+        return RangeTerms(**kept_of)
 
     def with_lever(self, change_m: Array) -> RangeTerms:
         """Return the same with a lever arm that is longer by (3,), camera axes, m."""

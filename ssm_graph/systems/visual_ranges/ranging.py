@@ -387,7 +387,8 @@ class Ranging:
         best = int(np.argmin(fit.cost))
         if best and fit.cost[best] < fit.cost[0] - self.rules.gap:
             self.found = found = solution(problem, fit.unknowns[best], is_near=True)
-        least, kept = float(fit.cost.min()), []
+        least = float(fit.cost.min())
+        kept: list[tuple[Array, float]] = []
         for unknowns, cost in zip(fit.unknowns, fit.cost, strict=True):
             one = unknowns[2 + 4 * i : 6 + 4 * i]
             place = one[:3] + np.exp(unknowns[0]) * problem.middle
