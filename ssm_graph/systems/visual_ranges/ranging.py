@@ -160,7 +160,7 @@ class Ranging:
 
     def check_again(self) -> None:
         """Have the next update search everywhere, however few ranges have come since it did."""
-        self._checked = 0
+        self._tried = self._checked = 0
 
     def restart(self) -> None:
         """Forget scale and anchors: the map's scale has changed. The next update starts anew."""
