@@ -63,7 +63,7 @@ def _map(rr: Any, stream: Any, result: VisualResult, scale: float) -> None:
     seen = world.points_views >= 2
     grey = np.repeat(world.points_grey[seen, None], 3, axis=1)
     stream.log("map/points", rr.Points3D(scale * world.points[seen], colors=grey), static=True)
-    known = np.isfinite(place).all(axis=1)
+    known = np.asarray(np.isfinite(place).all(axis=1))
     pieces = np.split(np.arange(len(place)), np.flatnonzero(np.diff(known)) + 1)
     strips = [place[piece] for piece in pieces if known[piece[0]]]
     stream.log("map/path", rr.LineStrips3D(strips, colors=[PATH_COLOUR]), static=True)

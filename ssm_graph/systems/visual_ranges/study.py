@@ -97,13 +97,16 @@ _RECORDED: Final[Mapping[str, Recorded]] = {
     )
     for n in (0, 1, 3)
 }
-RECORDED: Final[Mapping[str, Recorded]] = _RECORDED | {
-    f"{name}-arm": replace(
-        _RECORDED[name],
-        about=f"{_RECORDED[name].about}, lever arm to be found",
-        lever_sigma_m=sigma,
-    )
-    for name, sigma in (("kitchen-1", 0.05), ("kitchen-3", 0.05), ("kitti-1", 0.5))
+RECORDED: Final[Mapping[str, Recorded]] = {
+    **_RECORDED,
+    **{
+        f"{name}-arm": replace(
+            _RECORDED[name],
+            about=f"{_RECORDED[name].about}, lever arm to be found",
+            lever_sigma_m=sigma,
+        )
+        for name, sigma in (("kitchen-1", 0.05), ("kitchen-3", 0.05), ("kitti-1", 0.5))
+    },
 }
 """By name; with ``-arm`` what the truth is a path of, from which ranges are simulated, is not taken
 for the camera: it may be elsewhere on the car, or on the sensor in the hand."""
