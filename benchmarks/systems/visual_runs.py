@@ -105,14 +105,16 @@ def main() -> None:
         Option("--runs", 0, "of each case, at most; 0: what the goals ask for"),
         Option("--first-seed", FIRST_FRESH, "the first seed"),
         Option("--duration", 0.0, "of a run, s; 0: that of its case"),
-        Option("--minutes", 0.0, "after which no run is started; 0: no end"),
+        Option(
+            "--minutes", -1.0, "after which no run is started: 0 for the page alone; -1: no end"
+        ),
     )
     asked = report.args
     ledger = Ledger(
         asked.out / "runs.jsonl", {"first_seed": asked.first_seed, "duration_s": asked.duration}
     )
     keys = keys_of(asked.cases, asked.runs, asked.first_seed, asked.duration)
-    end = time.monotonic() + 60.0 * asked.minutes if asked.minutes else np.inf
+    end = time.monotonic() + 60.0 * asked.minutes if asked.minutes >= 0.0 else np.inf
     for count, key in enumerate(keys, 1):
         if key not in ledger and time.monotonic() < end:
             note(f"{count} of {len(keys)}: {key[0]}, seed {key[1]}")
