@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -46,6 +47,7 @@ files in DIR:
   map.npz          the map, for --in-map
   result.json      verdict, reasons, notes, errors where there is a truth
   report.html      all of it in words, tables and figures
+  recording.rrd    with --recording: map, path, images and ranges for the viewer of rerun
 
 With --in-map, only trajectory.tum: where in an earlier map each image was taken. The exit code is
 0 where the map is in metres and more than half of the images were found, 4 else.
@@ -77,6 +79,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--lever-arm-m", nargs=3, type=float, metavar=("X", "Y", "Z"), help="camera to antenna"
     )
+    number_option(
+        parser, "--lever-arm-sigma-m", "M", "of each of its numbers: above 0 it is found as well"
+    )
     number_option(parser, "--rate-hz", "HZ", "of images that carry no times")
     number_option(parser, "--start-s", "S", "time of the first image on the clock of the ranges")
     number_option(parser, "--first", "N", "first image that is used", 0, kind=int)
@@ -89,6 +94,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--threads", action="store_true", help="map beside tracking: faster, not bit for bit"
     )
+    parser.add_argument(
+        "--recording", action="store_true", help="write recording.rrd, for the viewer of rerun, too"
+    )
     parser.set_defaults(run=run)
 
 
@@ -100,12 +108,17 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     from ssm_graph.systems.visual_ranges.page import write_page
     from ssm_graph.systems.visual_ranges.readers.images import WatchedImages
     from ssm_graph.systems.visual_ranges.readers.source import read_sequence
+    from ssm_graph.systems.visual_ranges.recording import RECORDING_NAME, rerun, write_recording
     from ssm_graph.systems.visual_ranges.verdict import judged
 
+    if arguments.recording:
+        rerun()  # said before the work, not after it
     check_is_free(arguments.out, may_overwrite=arguments.overwrite)
     sequence = read_sequence(arguments.recording, _options(arguments))
     if arguments.no_ranges:
         sequence = _without_ranges(sequence)
+    if arguments.lever_arm_sigma_m is not None:
+        sequence = replace(sequence, lever_arm_sigma_m=arguments.lever_arm_sigma_m)
     for note in sequence.notes:
         say(errors, f"note: {note}")
     if arguments.in_map is not None:
@@ -120,6 +133,8 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     figures = write_figures(arguments.out, sequence, result, found, off)
     page = arguments.out / "report.html"
     write_page(page, sequence, result, found, off, figures, defects)
+    if arguments.recording:
+        write_recording(arguments.out / RECORDING_NAME, sequence, result)
     for line in lines(result, found, off):
         say(console, line)
     say(console, f"results in {arguments.out}, report in {page}")
@@ -144,8 +159,6 @@ def _options(arguments: argparse.Namespace) -> ReadOptions:
 
 
 def _without_ranges(sequence: Sequence) -> Sequence:
-    from dataclasses import replace
-
     from ssm_graph.systems.visual_ranges.ranges import screened_ranges
 
     return replace(sequence, ranges=screened_ranges([], [], []))
@@ -262,6 +275,9 @@ def lines(result: VisualResult, found: Judged, off: Accuracy | None) -> list[str
                 f"{anchor.bias_m:+.2f} m; {100 * anchor.nlos_share:.0f} % of {anchor.n_ranges} "
                 "ranges not believed"
             )
+        if ranging.lever_error_m.any():
+            change = ", ".join(f"{x:+.3f}" for x in ranging.lever_error_m)
+            told.append(f"  the lever arm is off by {change} m, camera axes")
         own = ranging.vehicle
         if own is not None:
             down = ", ".join(f"{x:.3f}" for x in own.down)

@@ -322,3 +322,17 @@ def test_visual_runs(tmp_path: Path) -> None:
     assert done.code == 0
     ((_, runs, verdicts, *_),) = done.rows("room, no ranges, 320 x 240")
     assert (runs, verdicts) == ("1 of 1", "1 NO_SCALE")
+    goals = done.rows("corridor, one anchor")
+    assert len(goals) > 5
+    assert {goal[-1] for goal in goals} == {"not run"}
+
+
+@pytest.mark.benchmark
+def test_visual_beside(tmp_path: Path) -> None:
+    """Ours alone, for the others need not be installed: all images of two seconds have a pose."""
+    options = "--sequences room --systems ssm-graph --images 60"
+    done = run("systems.visual_beside", options, "visual_beside", tmp_path)
+    assert done.code == 0
+    ((_, system, poses, error, *_),) = done.rows("room")
+    assert (system, poses) == ("ssm-graph", "60 of 60")
+    assert float(error) < 0.02

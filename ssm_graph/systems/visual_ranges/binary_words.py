@@ -46,7 +46,7 @@ class WordTree:
         if len(descriptors) > MOST_TRAINED:
             kept = rng.choice(len(descriptors), MOST_TRAINED, replace=False)
             descriptors = descriptors[np.sort(kept)]
-        self._centres: list[Descriptors] = []
+        self.centres: list[Descriptors] = []
         """By level, (nodes, BRANCHES, 32)"""
         node = np.zeros(len(descriptors), dtype=np.int64)
         for level in range(DEPTH):
@@ -59,7 +59,7 @@ class WordTree:
                 members = order[ends[k] : ends[k + 1]]
                 if len(members):
                     centres[k], label[members] = _clusters(descriptors[members], rng)
-            self._centres.append(centres)
+            self.centres.append(centres)
             node = node * BRANCHES + label
 
     @property
@@ -70,7 +70,7 @@ class WordTree:
     def words(self, descriptors: Descriptors) -> Indices:
         """Return the word (n,) of each descriptor (n, 32)."""
         node = np.zeros(len(descriptors), dtype=np.int64)
-        for centres in self._centres:
+        for centres in self.centres:
             distance = hamming(descriptors[:, None], centres[node])
             node = node * BRANCHES + distance.argmin(axis=1)
         return node

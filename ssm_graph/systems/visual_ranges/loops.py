@@ -392,7 +392,7 @@ def judge_of(ranging: Ranging | None, world: VisualMap) -> Judge | None:
     if ranging is None or not ranging.has_scale or ranging.terms is None:
         return None
     assert ranging.found is not None
-    found, terms = ranging.found, ranging.terms
+    found, terms = ranging.found, ranging.terms.with_lever(ranging.lever_error_m)
     recent = ranging.ranges.time_s[terms.row]
     recent = recent > recent[-1] - JUDGED_S
     rows, places = [], []

@@ -17,11 +17,13 @@ from ssm_graph.systems.visual_ranges.bundle import FurtherTerms
 from ssm_graph.systems.visual_ranges.bundle_metric import BundleMetric
 from ssm_graph.systems.visual_ranges.bundle_ranges import BundleRanges
 from ssm_graph.systems.visual_ranges.loop_closing import Step
+from ssm_graph.systems.visual_ranges.range_rows import known_spacing, of_anchors
 from ssm_graph.systems.visual_ranges.range_terms import FramePoses
 from ssm_graph.systems.visual_ranges.ranges import Ranges
 from ssm_graph.systems.visual_ranges.ranging import Ranging, RangingResult
 from ssm_graph.systems.visual_ranges.ranging_result import VehicleResult
 from ssm_graph.systems.visual_ranges.start import StartRules, StartState
+from ssm_graph.systems.visual_ranges.two_scales import OwnScale, contradiction
 from ssm_graph.systems.visual_ranges.vehicle import Vehicle
 from ssm_graph.systems.visual_ranges.vehicle_terms import (
     MetricState,
@@ -45,20 +47,23 @@ class Metric:
         lever_arm_m: Array,
         vehicle: Vehicle = Vehicle(),  # noqa: B008
         rules: StartRules | None = None,
+        lever_sigma_m: float = 0.0,
     ) -> None:
         """Take all that was measured; only what is before the newest frame is used.
 
         Parameters
         ----------
         lever_arm_m : (3,) camera to the ranges' antenna, camera axes.
+        lever_sigma_m : standard deviation of each of its numbers; above 0 it is found as well.
         """
         self.vehicle = vehicle
         self.rules = StartRules() if rules is None else rules
-        self.ranging = Ranging(ranges, lever_arm_m, self.rules)
+        self.ranging = Ranging(ranges, lever_arm_m, self.rules, lever_sigma_m)
         self.terms: VehicleTerms | None = None
         self.state: MetricState | None = None
         self.started_s = float("nan")
         self._history: list[tuple[float, float, float]] = []
+        self._poses: tuple[Array, Array] | None = None
         self._own_share = vehicle.scale_share
         self.link = max(float(np.hypot(self._own_share, vehicle.range_scale_share)), LEAST_LINK)
 
@@ -102,6 +107,7 @@ class Metric:
         R_cw, t_cw, time_s : (K, 3, 3), (K, 3) and (K,) of the key frames.
         """
         told, prior = [], None
+        self._poses = (R_cw, t_cw)
         if self.vehicle.has_aids:
             self.terms, was_aided = hung(self.vehicle, time_s), self.is_aided
             self.state = metric_state(self.terms, R_cw, t_cw)
@@ -232,4 +238,28 @@ class Metric:
             self._own_sigma,
             float(self.ranging.scale / np.exp(log_scale)) if has_both else float("nan"),
             float(np.hypot(told.sigma_log_scale, self._own_sigma)) if has_both else float("nan"),
+            self._contradiction() if has_both else "",
+        )
+
+    def _contradiction(self) -> str:
+        """Return what speaks against both scales being one, asked of the ranges alone."""
+        assert self.state is not None
+        ranging = self.ranging
+        if ranging.terms is None or self._poses is None:
+            return ""
+        places = ranging.places(*self._poses)
+        used = np.array(ranging.used)
+        own, _ = of_anchors(places, used)
+        lost_s = np.array([ranging.anchors[j].lost_s for j in ranging.used])
+        own = own.rows(np.flatnonzero(own.time_s < lost_s[own.anchor]))
+        return contradiction(
+            own,
+            tuple(ranging.anchors[j].name for j in ranging.used),
+            OwnScale(
+                "depth sensor" if self.vehicle.dead_reckoning is None else "dead reckoning (DVL)",
+                self.state.log_scale,
+                float(np.hypot(self._own_sigma, self.vehicle.range_scale_share)),
+            ),
+            self.rules,
+            spacing=known_spacing(ranging.ranges.known_position, used),
         )

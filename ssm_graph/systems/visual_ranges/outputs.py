@@ -162,6 +162,7 @@ def summary_of(
             "started_s": _plain(ranging.started_s),
             "clock_s": _plain(ranging.clock_s),
             "clock_sigma_s": _plain(ranging.clock_sigma_s),
+            "lever_arm_error_m": ranging.lever_error_m.tolist(),
         }
         if ranging.vehicle is not None:
             own = ranging.vehicle
@@ -173,6 +174,7 @@ def summary_of(
                 "relative_sigma": _plain(own.sigma_log_scale),
                 "range_unit_m": _plain(own.range_unit),
                 "range_unit_sigma": _plain(own.range_unit_sigma),
+                "contradiction": own.contradiction,
             }
     if errors is not None:
         found["against_truth"] = {

@@ -7,7 +7,8 @@ axes (m), scale ``s``, anchor ``a`` (m, from the same middle), bias ``b`` and cl
 
 ``D z`` is what the path may have drifted by and ``B y`` how a bias may have walked: both are random
 walks, as few of their Karhunen-Loeve modes as matter, with coefficients of unit variance. They are
-estimated and thrown away, so that what remains has an honest covariance.
+estimated and thrown away, so that what remains has an honest covariance. So is what a lever arm is
+off by that is not known exactly: ``A w`` beside ``l``, in the camera's axes.
 """
 
 from __future__ import annotations
@@ -63,14 +64,21 @@ class Places(NamedTuple):
     """(M,)"""
     time_s: Array
     """(M,)"""
+    arm: Array | None = None
+    """(M, 3, 3) m for each coefficient of the lever arm's error; None where it is exact"""
 
     def rows(self, kept: Indices) -> Places:
         """Return some of them."""
-        return Places._make(column[kept] for column in self)
+        return Places._make(None if column is None else column[kept] for column in self)
 
 
-def places_of(terms: RangeTerms, R_cw: Array, t_cw: Array, time_s: Array) -> Places:
-    """Return the places of ranges that hang on key frames; ``time_s`` (all ranges,) their times."""
+def places_of(
+    terms: RangeTerms, R_cw: Array, t_cw: Array, time_s: Array, lever_sigma_m: float = 0.0
+) -> Places:
+    """Return the places of ranges that hang on key frames; ``time_s`` (all ranges,) their times.
+
+    ``lever_sigma_m``: standard deviation of each of the lever arm's three numbers.
+    """
     R_wc = np.swapaxes(R_cw[terms.key_frame], 1, 2)
 
     def turned(vector: Array) -> Array:
@@ -85,6 +93,7 @@ def places_of(terms: RangeTerms, R_cw: Array, t_cw: Array, time_s: Array) -> Pla
         terms.range_m,
         terms.sigma_m,
         time_s[terms.row],
+        lever_sigma_m * R_wc @ terms.axes if lever_sigma_m and terms.axes is not None else None,
     )
 
 
@@ -118,7 +127,8 @@ class Problem(ReadOnlyArrays):
     def n_unknowns(self) -> int:
         """With the modes."""
         drift, walk = self.drift.shape[1], self.walk.shape[1]
-        return int(self.n_core + 3 * drift + self.n_anchors * walk)
+        arm = 0 if self.places.arm is None else 3
+        return int(self.n_core + 3 * drift + self.n_anchors * walk + arm)
 
     def prior_information(self) -> Array:
         """Return its diagonal (P,)."""
@@ -178,9 +188,12 @@ def residuals(problem: Problem, unknowns: Array) -> tuple[Array, Array]:
     own = unknowns[:, 2:core].reshape(n_sets, n_anchors, 4)[:, at.anchor]
     n_drift, n_walk = problem.drift.shape[1], problem.walk.shape[1]
     z = unknowns[:, core : core + 3 * n_drift].reshape(n_sets, n_drift, 3)
-    y = unknowns[:, core + 3 * n_drift :].reshape(n_sets, n_anchors, n_walk)[:, at.anchor]
+    first_walk, end = core + 3 * n_drift, core + 3 * n_drift + n_anchors * n_walk
+    y = unknowns[:, first_walk:end].reshape(n_sets, n_anchors, n_walk)[:, at.anchor]
     camera = at.camera + clock * at.velocity + problem.drift @ z
     line = s * camera + at.lever + clock * at.lever_rate - own[..., :3]
+    if at.arm is not None:
+        line = line + np.einsum("mij,sj->smi", at.arm, unknowns[:, end:])
     distance = np.linalg.norm(line, axis=2)
     u = line / np.maximum(distance, CLOSEST_M)[..., None]
     walked = np.einsum("mw,smw->sm", problem.walk, y)
@@ -193,8 +206,10 @@ def residuals(problem: Problem, unknowns: Array) -> tuple[Array, Array]:
     drift = s[..., None] * problem.drift[:, :, None] * u[:, :, None, :]
     J[:, :, core : core + 3 * n_drift] = drift.reshape(n_sets, n, 3 * n_drift)
     if n_walk:
-        first = core + 3 * n_drift + n_walk * at.anchor
+        first = first_walk + n_walk * at.anchor
         J[:, np.arange(n)[:, None], first[:, None] + np.arange(n_walk)] = problem.walk
+    if at.arm is not None:
+        J[:, :, end:] = np.einsum("smi,mij->smj", u, at.arm)
     return error, J
 
 
@@ -308,6 +323,8 @@ class Solution(ReadOnlyArrays):
     """Deviance of ranges and priors."""
     drift_square: float = 1.0
     """Mean square of the path's modes, what is open of them included: 1 as expected."""
+    arm: Array | None = None
+    """(3,) coefficients of the lever arm's error; None where it is exact"""
 
     @property
     def sigma_log_scale(self) -> float:
@@ -350,6 +367,8 @@ def solution(
     covariance = covariance * _repeated(problem, weight[0] * error[0])
     cost = float(_cost(problem, at, error)[0])
     found = _outwards(problem, at[0], covariance, (error[0], variance[0], weight[0]), cost)
+    if problem.places.arm is not None:
+        found = replace(found, arm=at[0, -3:].copy())
     return replace(found, drift_square=float(square.mean())) if square.size else found
 
 
@@ -429,8 +448,3 @@ def unknowns_of(
     own = np.column_stack([anchors - scale * problem.middle, biases]).ravel()
     modes = np.zeros(problem.n_unknowns - problem.n_core)
     return np.concatenate([[np.log(scale), clock_s], own, modes])
-
-
-def with_sigma(problem: Problem, sigma_m: Array) -> Problem:
-    """Return the problem with other standard deviations (M,) of its ranges."""
-    return replace(problem, places=problem.places._replace(sigma_m=sigma_m))

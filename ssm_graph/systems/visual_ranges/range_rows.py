@@ -8,19 +8,50 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.systems.visual_ranges.range_fit import Places, Solution
+from ssm_graph.systems.visual_ranges.range_fit import Places, Solution, problem_of
 from ssm_graph.systems.visual_ranges.ranges import Indices
-from ssm_graph.systems.visual_ranges.start import StartRules
-from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, POLISH
+from ssm_graph.systems.visual_ranges.start import StartRules, later_anchor
+from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, POLISH, robust_rms
 
 
 def plain_errors(at: Places, found: Solution) -> tuple[Array, Array]:
     """Return errors (M,), m, and weights (M,) of ranges at a solution, without modes."""
+    at = with_arm(at, found)
     camera = at.camera + found.clock_s * at.velocity
     line = found.scale * camera + at.lever + found.clock_s * at.lever_rate
     error = np.linalg.norm(line - found.anchors[at.anchor], axis=1) + found.biases[at.anchor]
     error = error - at.range_m
     return error, POLISH.weight(error, 0.0, at.sigma_m)
+
+
+def with_arm(at: Places, found: Solution) -> Places:
+    """Return places by the lever arm that was found, exact from now on."""
+    if at.arm is None or found.arm is None:
+        return at
+    return at._replace(lever=at.lever + at.arm @ found.arm, arm=None)
+
+
+def placed_later(
+    own: Places, found: Solution, rules: StartRules
+) -> tuple[Array, float, Array] | None:
+    """Return place, bias and covariance (4, 4) of an anchor by its ranges, if they tell them.
+
+    Scale and lever arm are those that were found already.
+    """
+    own = with_arm(own._replace(anchor=np.zeros(len(own.anchor), dtype=np.intp)), found)
+    problem = problem_of(own, 1, rules.kernel, drift=0.0, bias_walk_m=0.0)
+    places = later_anchor(problem, float(np.log(found.scale)), rules)
+    where, covariance, _ = places[0]
+    limit = rules.anchor_sigma_share * float(np.median(own.range_m))
+    limit = max(rules.anchor_sigma_m, limit)
+    if len(places) > 1 or float(np.sqrt(np.trace(covariance[:3, :3]))) > limit:
+        return None
+    place = where[:3] + found.scale * problem.middle
+    line = found.scale * own.camera + own.lever - place
+    error = np.linalg.norm(line, axis=1) + where[3] - own.range_m
+    if robust_rms(error) > rules.rms_sigmas * float(np.median(own.sigma_m)):
+        return None
+    return place, float(where[3]), covariance
 
 
 def is_sharp(found: Solution, rules: StartRules, at: Places, i: int) -> bool:

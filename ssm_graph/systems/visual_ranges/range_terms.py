@@ -13,7 +13,7 @@ further. Jacobians are of the left perturbation ``T_cw = Exp(rho, phi) T_cw``.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,13 +80,26 @@ class RangeTerms(ReadOnlyArrays):
     """(M,)"""
     sigma_m: Array
     """(M,)"""
+    axes: Array | None = None
+    """(M, 3, 3) of the camera there, key frame axes; None where no lever arm is to be found"""
 
     def __len__(self) -> int:
         return len(self.range_m)
 
     def rows(self, kept: NDArray[np.bool_] | Indices) -> RangeTerms:
         """Return some of them."""
-        return RangeTerms(*(getattr(self, name)[kept] for name in self.__dataclass_fields__))
+        kept_of: dict[str, Any] = {
+            name: None if column is None else column[kept]
+            for name in self.__dataclass_fields__
+            for column in [getattr(self, name)]
+        }
+        return RangeTerms(**kept_of)
+
+    def with_lever(self, change_m: Array) -> RangeTerms:
+        """Return the same with a lever arm that is longer by (3,), camera axes, m."""
+        if self.axes is None:
+            return self
+        return replace(self, lever=self.lever + self.axes @ change_m)
 
     def on(self, pose: Indices) -> RangeTerms:
         """Return the same on key frames counted otherwise: (M,) of each."""
@@ -183,4 +196,5 @@ def hang(
         lever_rate=np.einsum("mij,mj->mi", R_kc, np.cross(turn / span[:, None], arm)),
         range_m=ranges.range_m[row],
         sigma_m=ranges.sigma_m[row],
+        axes=R_kc,
     )

@@ -30,6 +30,7 @@ from ssm_graph.systems.visual_ranges.range_rows import (
     largest_turn,
     lost_since,
     of_anchors,
+    placed_later,
     plain_errors,
 )
 from ssm_graph.systems.visual_ranges.range_terms import FramePoses, RangeTerms, hang
@@ -40,9 +41,9 @@ from ssm_graph.systems.visual_ranges.start import (
     StartRules,
     StartState,
     find_start,
-    later_anchor,
+    moved,
 )
-from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, POLISH, robust_rms
+from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, POLISH
 from ssm_graph.systems.visual_ranges.widening import widened
 
 __all__ = ["Anchor", "AnchorState", "Ranging", "RangingResult"]
@@ -73,14 +74,22 @@ class _Own(NamedTuple):
 class Ranging:
     """The ranges of a run."""
 
-    def __init__(self, ranges: Ranges, lever_arm_m: Array, rules: StartRules | None = None) -> None:
+    def __init__(
+        self,
+        ranges: Ranges,
+        lever_arm_m: Array,
+        rules: StartRules | None = None,
+        lever_sigma_m: float = 0.0,
+    ) -> None:
         """Take all ranges of the run; only those before the newest frame are used.
 
         Parameters
         ----------
         lever_arm_m : (3,) camera to antenna, camera axes.
+        lever_sigma_m : standard deviation of each of its numbers; above 0 it is found as well.
         """
         self.ranges, self.lever_arm_m = ranges, np.asarray(lever_arm_m, dtype=np.float64)
+        self.lever_sigma_m = lever_sigma_m
         self.rules = StartRules() if rules is None else rules
         self.anchor: Indices = ranges.anchor.copy()
         self.anchors = [_Own(name) for name in ranges.names]
@@ -125,7 +134,7 @@ class Ranging:
         self.terms = replace(self.terms, anchor=self.anchor[self.terms.row])
         if not len(self.terms):
             return []
-        places = places_of(self.terms, R_cw, t_cw, self.ranges.time_s)
+        places = self.places(R_cw, t_cw)
         now = float(places.time_s[-1])
         if self.found is None:
             if len(places.time_s) < TRY_AGAIN * self._tried:
@@ -137,6 +146,24 @@ class Ranging:
         if self.found is not None:
             self.history.append((now, self.found.scale, self.found.sigma_log_scale))
         return told
+
+    def places(self, R_cw: Array, t_cw: Array) -> Places:
+        """Return where the antenna was at each range, by the key frames' poses."""
+        assert self.terms is not None
+        return places_of(self.terms, R_cw, t_cw, self.ranges.time_s, self.lever_sigma_m)
+
+    @property
+    def lever_error_m(self) -> Array:
+        """(3,) what the lever arm is off by, camera axes, as far as ranges tell."""
+        arm = None if self.found is None else self.found.arm
+        return np.zeros(3) if arm is None else self.lever_sigma_m * arm
+
+    def check_again(self) -> None:
+        """Have the next update search everywhere, however few ranges have come since it did.
+
+        It refuses nothing: halves that were asked once more refused 1 of 12 sound walks of a room.
+        """
+        self._tried = self._checked = 0
 
     def restart(self) -> None:
         """Forget scale and anchors: the map's scale has changed. The next update starts anew."""
@@ -155,24 +182,19 @@ class Ranging:
             return None
         column = np.full(len(self.anchors), -1, dtype=np.intp)
         column[self.used] = np.arange(len(self.used))
-        doubtful = [own.state is AnchorState.DOUBTFUL for own in self.anchors]
-        column[doubtful] = -1
+        column[[own.state is AnchorState.DOUBTFUL for own in self.anchors]] = -1
         known = pose_of[np.minimum(self.terms.key_frame, len(pose_of) - 1)]
         known = np.where(self.terms.key_frame < len(pose_of), known, -1)
         kept = (known >= 0) & (column[self.terms.anchor] >= 0)
         if not kept.any():
             return None
-        own = self.terms.rows(kept)
+        own = self.terms.rows(kept).with_lever(self.lever_error_m)
         return BundleRanges(
-            replace(own, anchor=column[own.anchor]),
-            known[kept],
-            self.found.scale,
-            self.found.clock_s,
-            self.found.anchors,
-            self.found.biases,
+            replace(own, anchor=column[own.anchor]), known[kept],
+            self.found.scale, self.found.clock_s, self.found.anchors, self.found.biases,
             POLISH,  # what is far too long would bend biases and anchors otherwise
             is_free,
-        )
+        )  # fmt: skip
 
     def adopt(self, extra: Array, covariance: Array, further: BundleRanges) -> None:
         """Take over what an adjustment with free scale and anchors found, (E,) and (E, E).
@@ -201,20 +223,16 @@ class Ranging:
             if found.sigma_log_scale > self.rules.ready_sigma:
                 state = StartState.COARSE
         return RangingResult(
-            state,
-            self.scale,
-            found.sigma_log_scale if found is not None else float("nan"),
+            state, self.scale, found.sigma_log_scale if found is not None else float("nan"),
             found.clock_s if found is not None else 0.0,
             float(np.sqrt(found.covariance[1, 1])) if found is not None else float("nan"),
             tuple(self._shown(j) for j in range(len(self.anchors))),
-            self.error.copy(),
-            self.weight.copy(),
-            self.anchor.copy(),
+            self.error.copy(), self.weight.copy(), self.anchor.copy(),
             np.array(self.history).reshape(-1, 3),
             () if self.start is None else self.start.reasons,
             "" if self.start is None else self.start.advice,
-            self.started_s,
-        )
+            self.started_s, lever_error_m=self.lever_error_m,
+        )  # fmt: skip
 
     def _shown(self, j: int) -> Anchor:
         own, found = self.anchors[j], self.found
@@ -223,21 +241,14 @@ class Ranging:
         if found is not None and j in self.used:
             i = self.used.index(j)
             place, covariance = found.anchors[i].copy(), found.anchor_covariance(i).copy()
-            bias, sigma = (
-                float(found.biases[i]),
-                float(np.sqrt(found.covariance[5 + 4 * i, 5 + 4 * i])),
-            )
+            square = found.covariance[5 + 4 * i, 5 + 4 * i]
+            bias, sigma = float(found.biases[i]), float(np.sqrt(square))
         return Anchor(
-            own.name,
-            own.state,
-            place,
-            covariance,
-            bias,
-            float(sigma),
+            own.name, own.state, place, covariance, bias, float(sigma),
             np.array([where for where, _ in own.alternatives]).reshape(-1, 3),
             int((self.anchor == j).sum()),
             float(np.mean(weight < NLOS_WEIGHT)) if len(weight) else float("nan"),
-        )
+        )  # fmt: skip
 
     def _start(self, places: Places, turned_rad: float) -> list[str]:
         """Try to find scale and the anchors that have ranges enough."""
@@ -303,8 +314,8 @@ class Ranging:
         self.found = polished(problem, solution(problem, start, rounds=3))
         told: list[str] = []
         if len(places.time_s) > CHECK_AGAIN * self._checked:
-            self._checked = len(places.time_s)
-            told = self._check(own, problem)
+            may_refuse, self._checked = self._checked > 0, len(places.time_s)
+            told = self._check(own, problem, may_refuse=may_refuse)
             self._rivals(problem)
         assert self.terms is not None
         row = self.terms.row[kept]
@@ -312,7 +323,7 @@ class Ranging:
         self.error[row[fits]], self.weight[row[fits]] = self.found.error, self.found.weight
         return [*told, *self._sharpened(everything, self.weight[row], now)]
 
-    def _check(self, own: Places, problem: Problem) -> list[str]:
+    def _check(self, own: Places, problem: Problem, *, may_refuse: bool) -> list[str]:
         """Search everywhere again, with all ranges of the anchors in use; take what is better."""
         assert self.found is not None
         names = tuple(self.anchors[j].name for j in self.used)
@@ -320,13 +331,21 @@ class Ranging:
             own, names, self.rules, turned_rad=np.inf, spacing=problem.spacing,
             scale_prior=self._scale_prior,
         )  # fmt: skip
-        was_refused, self.start = self.is_refused, again
+        was_refused = self.is_refused
+        if may_refuse or was_refused or again.state is not StartState.REFUSED:
+            self.start = again
         told, best = [], again.solution
         if self.is_refused != was_refused:
             what = "; ".join(again.reasons) if self.is_refused else "no contradiction any more"
             told = [f"scale {'doubted' if self.is_refused else 'believed again'}: {what}"]
         if best is None:
             return told
+        # A place that is as good by now was not there, or was left, when there were fewer ranges.
+        for i, j in enumerate(self.used):
+            known, others = self.anchors[j].alternatives, (best, *again.alternatives)
+            fresh = [one for one in others if moved(self.found, one, i)]
+            found = [(one.anchors[i].copy(), float(one.biases[i])) for one in fresh]
+            self._set(j, alternatives=(*known, *found))
         other = unknowns_of(problem, best.scale, best.anchors, best.biases, best.clock_s)
         fit = search(problem, np.array([self.found.unknowns, other]))
         if fit.cost[1] < fit.cost[0] - self.rules.gap:
@@ -353,10 +372,8 @@ class Ranging:
             lost_s = np.inf
             marked = weight[recent] < NLOS_WEIGHT
             if recent.sum() >= LEAST_RECENT and float(np.mean(marked)) > DOUBTFUL_SHARE:
-                state, lost_s = (
-                    AnchorState.DOUBTFUL,
-                    min(own.lost_s, lost_since(self.ranges.time_s, self.anchor == j, self.weight)),
-                )
+                since = lost_since(self.ranges.time_s, self.anchor == j, self.weight)
+                state, lost_s = AnchorState.DOUBTFUL, min(own.lost_s, since)
             if own.state is not state:
                 told.append(f"anchor {own.name}: {state.value}")
             self._set(j, state=state, lost_s=lost_s)
@@ -375,17 +392,20 @@ class Ranging:
         best = int(np.argmin(fit.cost))
         if best and fit.cost[best] < fit.cost[0] - self.rules.gap:
             self.found = found = solution(problem, fit.unknowns[best], is_near=True)
-        least, kept = float(fit.cost.min()), []
+        least = float(fit.cost.min())
+        kept: list[tuple[Array, float]] = []
         for unknowns, cost in zip(fit.unknowns, fit.cost, strict=True):
             one = unknowns[2 + 4 * i : 6 + 4 * i]
             place = one[:3] + np.exp(unknowns[0]) * problem.middle
-            apart = float(np.linalg.norm(place - found.anchors[i])) > SAME_PLACE_M
-            if apart and cost < least + self.rules.gap:
+            taken = np.array([found.anchors[i], *(other for other, _ in kept)])
+            is_new = float(np.linalg.norm(taken - place, axis=1).min()) > SAME_PLACE_M
+            if is_new and cost < least + self.rules.gap:
                 kept.append((place, float(one[3])))
         self._set(self.used[i], alternatives=(*kept,))
 
     def _later(self, places: Places) -> list[str]:
         """Place anchors that have ranges enough by now, and anew those that seem to have moved."""
+        assert self.found is not None
         told = []
         for j in range(len(self.anchors)):
             own, unused = self.anchors[j], j not in self.used
@@ -398,36 +418,18 @@ class Ranging:
                 continue
             if float(np.ptp(places.time_s[rows])) < self.rules.least_s:
                 continue
-            placed = self._placed(places.rows(rows))
+            placed = placed_later(places.rows(rows), self.found, self.rules)
             if placed is None:
                 continue
             told.append(self._take(j, *placed, since))
         return told
 
-    def _placed(self, own: Places) -> tuple[Array, float, Array] | None:
-        """Return place, bias and covariance (4, 4) of an anchor, if its ranges tell them."""
-        assert self.found is not None
-        own = own._replace(anchor=np.zeros(len(own.anchor), dtype=np.intp))
-        problem = problem_of(own, 1, self.rules.kernel, drift=0.0, bias_walk_m=0.0)
-        found = later_anchor(problem, float(np.log(self.found.scale)), self.rules)
-        where, covariance, _ = found[0]
-        limit = self.rules.anchor_sigma_share * float(np.median(own.range_m))
-        limit = max(self.rules.anchor_sigma_m, limit)
-        if len(found) > 1 or float(np.sqrt(np.trace(covariance[:3, :3]))) > limit:
-            return None
-        place = where[:3] + self.found.scale * problem.middle
-        line = self.found.scale * own.camera + own.lever - place
-        error = np.linalg.norm(line, axis=1) + where[3] - own.range_m
-        if robust_rms(error) > self.rules.rms_sigmas * float(np.median(own.sigma_m)):
-            return None
-        return place, float(where[3]), covariance
-
     def _take(self, j: int, place: Array, bias: float, covariance: Array, since: float) -> str:
         """Take an anchor into use; one that moved becomes another from some time on."""
         assert self.found is not None
         name = self.anchors[j].name
-        moved = bool(np.isfinite(since))
-        if moved:
+        has_moved = bool(np.isfinite(since))
+        if has_moved:
             recent = (self.anchor == j) & (self.ranges.time_s >= since)
             self.anchors.append(_Own(f"{name} from {since:.1f} s"))
             self.anchor[recent] = len(self.anchors) - 1
@@ -445,4 +447,4 @@ class Ranging:
             biases=np.append(found.biases, bias),
             covariance=wider,
         )
-        return f"anchor {name} " + ("has moved: placed anew" if moved else "placed")
+        return f"anchor {name} " + ("has moved: placed anew" if has_moved else "placed")

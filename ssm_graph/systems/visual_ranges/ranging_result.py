@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
+
+import numpy as np
 
 from ssm_graph.base.frozen import Array, ReadOnlyArrays
 from ssm_graph.systems.visual_ranges.ranges import Indices
@@ -54,6 +56,8 @@ class VehicleResult(ReadOnlyArrays):
     range_unit: float
     """Unit of the ranges in metres: assumed over true sound speed; NaN without ranges."""
     range_unit_sigma: float
+    contradiction: str
+    """What speaks against this scale and that of the ranges being one; "" where nothing does."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -83,6 +87,8 @@ class RangingResult(ReadOnlyArrays):
     """Time at which the scale was ready; NaN before."""
     vehicle: VehicleResult | None = None
     """None where it told no scale."""
+    lever_error_m: Array = field(default_factory=lambda: np.zeros(3))
+    """(3,) what the stated lever arm is off by, camera axes; zero where it is exact."""
 
     @property
     def has_scale(self) -> bool:

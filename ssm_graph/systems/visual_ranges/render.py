@@ -1,19 +1,21 @@
-"""Grey images of a world of walls, by plain NumPy: inverse depth and place on a wall are planes.
+"""Grey images of a world of walls: inverse depth and place on a wall are planes.
 
 Along a ray ``d = (x, y, 1)`` of the camera, a wall's plane is met at the depth ``1 / w`` with ``w``
 linear in x and y, and so are the coordinates on the wall times ``w``: three rows of numbers a wall,
-and one division a pixel.
+and one division a pixel. Compiled loops draw, or NumPy where numba is not there; a test holds them
+to be equal.
 """
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.systems.visual_ranges.camera import Camera
+from ssm_graph.systems.visual_ranges.extras import compiled, numba_is_used
 from ssm_graph.systems.visual_ranges.world import Picture, Wall, World
 
 Image = NDArray[np.uint8]
@@ -21,6 +23,12 @@ Window = tuple[slice, slice]
 
 NEAREST_M: Final = 0.05
 """Walls nearer than this are not drawn."""
+LEAST_SLANT: Final = 0.05
+"""Sine of the angle of sight, below which a footprint grows no more."""
+TOP_LEVEL: Final = 1.001
+"""So much below the number of levels: there is always a next one."""
+N_LEVELS: Final = 16
+"""Levels handed to the compiled loop, always as many, so that it is compiled once."""
 
 
 class Water(NamedTuple):
@@ -98,21 +106,100 @@ def _draw(
     R_wc, p_w = pose
     x = ((np.arange(lens.width) - lens.cx) / lens.fx).astype(np.float32)[window[1]]
     y = ((np.arange(lens.height) - lens.cy) / lens.fy).astype(np.float32)[window[0]]
-    away = (wall.corner_w - p_w) @ wall.normal_w
+    away = float((wall.corner_w - p_w) @ wall.normal_w)
     w_row = wall.normal_w @ R_wc / away
     offset = p_w - wall.corner_w
+    places = [axis @ R_wc + (axis @ offset) * w_row for axis in (wall.along_w, wall.up_w)]
+    planes = np.array([w_row, *places], dtype=np.float32)
+    pictures = world.pictures[wall.picture]
+    sides = (float(wall.size_m[0]), float(wall.size_m[1]), world.texel_m)
+    sight = (abs(away), float(lens.fx))
+    if numba_is_used():
+        padded = (*pictures, *pictures[-1:] * (N_LEVELS - len(pictures)))[:N_LEVELS]
+        n_levels = min(len(pictures), N_LEVELS)
+        _draw_loop(
+            planes, x, y, sides, sight, padded, n_levels, inverse_depth[window], grey[window]
+        )
+    else:
+        _draw_numpy(planes, x, y, sides, sight, pictures, inverse_depth[window], grey[window])
 
-    def plane(row: Array) -> Picture:
-        a, b, c = row.astype(np.float32)
+
+@compiled
+def _one_loop(picture: Any, u: Any, v: Any, step: Any) -> Any:  # pragma: no cover  (compiled)
+    """Do :func:`_bilinear` for one pixel, at places ``u``, ``v`` of the finest level."""
+    n_rows, n_columns = picture.shape
+    a, b = u * step - np.float32(0.5), v * step - np.float32(0.5)
+    column, row = np.floor(a), np.floor(b)
+    a, b = a - column, b - row
+    left, above = int(column), int(row)
+    if left < 0 or left >= n_columns:
+        left %= n_columns
+    if above < 0 or above >= n_rows:
+        above %= n_rows
+    right = 0 if left + 1 == n_columns else left + 1
+    below = 0 if above + 1 == n_rows else above + 1
+    top = picture[above, left] + a * (picture[above, right] - picture[above, left])
+    base = picture[below, left] + a * (picture[below, right] - picture[below, left])
+    return top + b * (base - top)
+
+
+@compiled
+def _draw_loop(  # pragma: no cover  (compiled)
+    planes: Any, x: Any, y: Any, sides: Any, sight: Any, pictures: Any, n_levels: Any,
+    inverse_depth: Any, grey: Any,
+) -> None:  # fmt: skip
+    """Do :func:`_draw_numpy`."""
+    texel = np.float32(sides[2])
+    for i in range(len(y)):
+        for j in range(len(x)):
+            w = y[i] * planes[0, 1] + (x[j] * planes[0, 0] + planes[0, 2])
+            if not w > inverse_depth[i, j]:
+                continue
+            u = (y[i] * planes[1, 1] + (x[j] * planes[1, 0] + planes[1, 2])) / w
+            v = (y[i] * planes[2, 1] + (x[j] * planes[2, 0] + planes[2, 2])) / w
+            if not (0.0 <= u <= sides[0] and 0.0 <= v <= sides[1]):
+                continue
+            inverse_depth[i, j] = w
+            slant = sight[0] * w / np.sqrt(1.0 + x[j] ** 2 + y[i] ** 2)
+            footprint = 1.0 / (w * sight[1] * np.sqrt(max(slant, LEAST_SLANT)))
+            level = min(np.log2(max(footprint / sides[2], 1.0)), n_levels - TOP_LEVEL)
+            low = int(level)
+            u, v = u / texel, v / texel
+            first = _one_loop(pictures[low], u, v, np.float32(0.5**low))
+            second = _one_loop(pictures[low + 1], u, v, np.float32(0.5 ** (low + 1)))
+            grey[i, j] = first + np.float32(level - low) * (second - first)
+
+
+def _draw_numpy(
+    planes: Picture,
+    x: Picture,
+    y: Picture,
+    sides: tuple[float, float, float],
+    sight: tuple[float, float],
+    pictures: tuple[Picture, ...],
+    inverse_depth: Picture,
+    grey: Picture,
+) -> None:
+    """Draw a wall in its window, in place.
+
+    Parameters
+    ----------
+    planes : (3, 3) of inverse depth, and of columns and rows on the wall times it, m.
+    x, y : of the rays of columns and rows.
+    sides : of the wall along and up, and of an element of its finest picture, m.
+    sight : distance of the wall's plane, m, and focal length, pixels.
+    """
+
+    def plane(row: Picture) -> Picture:
+        a, b, c = row
         return np.asarray(y[:, None] * b + (x * a + c)[None, :], dtype=np.float32)
 
-    w = plane(w_row)
-    old = inverse_depth[window]
-    rows, columns = np.nonzero(w > old)
+    w = plane(planes[0])
+    rows, columns = np.nonzero(w > inverse_depth)
     nearer = w[rows, columns]
     on: list[Picture] = []
-    for axis, size in zip((wall.along_w, wall.up_w), wall.size_m, strict=True):
-        place = plane(axis @ R_wc + (axis @ offset) * w_row)[rows, columns] / nearer
+    for row, size in zip(planes[1:], sides[:2], strict=True):
+        place = plane(row)[rows, columns] / nearer
         inside = (place >= 0.0) & (place <= size)
         if not inside.all():
             rows, columns, nearer = rows[inside], columns[inside], nearer[inside]
@@ -121,19 +208,17 @@ def _draw(
         on.append(place)
     if not len(rows):
         return
-    old[rows, columns] = nearer
+    inverse_depth[rows, columns] = nearer
     # A pixel's footprint, metres on the wall: wider where the wall is seen at a slant.
-    slant = np.abs(away) * nearer / np.sqrt(1 + x[columns] ** 2 + y[rows] ** 2)
-    footprint = 1.0 / (nearer * lens.fx * np.sqrt(np.maximum(slant, 0.05)))
-    grey[window][rows, columns] = _sampled(
-        world.pictures[wall.picture], on[0] / world.texel_m, on[1] / world.texel_m,
-        footprint / world.texel_m,
-    )  # fmt: skip
+    slant = sight[0] * nearer / np.sqrt(1 + x[columns] ** 2 + y[rows] ** 2)
+    footprint = 1.0 / (nearer * sight[1] * np.sqrt(np.maximum(slant, LEAST_SLANT)))
+    texel = sides[2]
+    grey[rows, columns] = _sampled(pictures, on[0] / texel, on[1] / texel, footprint / texel)
 
 
 def _sampled(pictures: tuple[Picture, ...], u: Picture, v: Picture, footprint: Picture) -> Picture:
     """Return grey at columns ``u`` and rows ``v``, between neighbours and between two levels."""
-    level = np.clip(np.log2(np.maximum(footprint, 1.0)), 0.0, len(pictures) - 1.001)
+    level = np.clip(np.log2(np.maximum(footprint, 1.0)), 0.0, len(pictures) - TOP_LEVEL)
     low = level.astype(np.intp)
     found = np.empty(len(u), dtype=np.float32)
     for number in range(int(low.min()), int(low.max()) + 1):

@@ -54,6 +54,8 @@ class Sequence(ShortRepr):
     """What the reader found and did, one sentence each, with file and line where there is one."""
     vehicle: Vehicle = Vehicle()
     """Depth and dead reckoning of what carries the camera."""
+    lever_arm_sigma_m: float = 0.0
+    """Standard deviation of each number of the lever arm; above 0 it is found with the rest."""
 
     def __len__(self) -> int:
         return len(self.time_s)

@@ -210,7 +210,7 @@ def _alone(problem: Problem, j: int) -> Problem:
     """Return the problem of one anchor, without modes."""
     own = np.flatnonzero(problem.places.anchor == j)
     places = problem.places.rows(own)
-    places = places._replace(anchor=np.zeros(len(own), dtype=np.intp))
+    places = places._replace(anchor=np.zeros(len(own), dtype=np.intp), arm=None)
     none = np.zeros((len(own), 0))
     return replace(problem, places=places, n_anchors=1, drift=none, walk=none, spacing=())
 
@@ -330,10 +330,11 @@ def _is_apart(best: Solution, rival: Solution) -> bool:
     """Return whether two minima differ by more than their sigmas."""
     if abs(np.log(rival.scale / best.scale)) > 3.0 * best.sigma_log_scale:
         return True
-    return any(_moved(best, rival, j) for j in range(len(best.anchors)))
+    return any(moved(best, rival, j) for j in range(len(best.anchors)))
 
 
-def _moved(best: Solution, rival: Solution, j: int) -> bool:
+def moved(best: Solution, rival: Solution, j: int) -> bool:
+    """Return whether an anchor is elsewhere in another solution: beyond 3 sigma, and 0.2 m."""
     way = rival.anchors[j] - best.anchors[j]
     square = float(way @ np.linalg.solve(best.anchor_covariance(j), way))
     return bool(square > SQUARE_OF_3_SIGMA and float(np.linalg.norm(way)) > 0.2)
@@ -410,7 +411,7 @@ def _sharp_anchors(
         sigma = float(np.sqrt(np.trace(best.anchor_covariance(j))))
         median = float(np.median(at.range_m[at.anchor == j]))
         limit = max(rules.anchor_sigma_m, rules.anchor_sigma_share * median)
-        rivals = [one for one in near if _moved(best, one, j)]
+        rivals = [one for one in near if moved(best, one, j)]
         if sigma > limit:
             doubts.append(f"anchor {name} known to {sigma:.2f} m, {limit:.2f} m are needed")
         elif rivals:

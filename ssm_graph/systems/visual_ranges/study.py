@@ -9,10 +9,12 @@ import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ssm_graph.base.errors import ConfigError, nearest_hint
 from ssm_graph.study.ledger import Key, Row
@@ -21,12 +23,13 @@ from ssm_graph.systems.visual_ranges.loop_settings import LoopSettings
 from ssm_graph.systems.visual_ranges.ranges import screened_ranges
 from ssm_graph.systems.visual_ranges.readers.source import read_sequence
 from ssm_graph.systems.visual_ranges.result import FrameState, VisualResult
-from ssm_graph.systems.visual_ranges.sequence import Sequence
+from ssm_graph.systems.visual_ranges.sequence import ImageOf, Sequence
 from ssm_graph.systems.visual_ranges.settings import VisualSettings
 from ssm_graph.systems.visual_ranges.simulate import (
     SMALL_CAMERA,
     ImageFaults,
     Run,
+    Simulated,
     simulate,
     under_water,
 )
@@ -40,6 +43,12 @@ SMALL_CORNERS: Final = 350
 """Corners followed in a quarter of the pixels."""
 SAME_PLACE_M: Final = 1.0
 """Error of the distance between two cameras from which a loop is false; walls repeat by 12.8 m."""
+LAST_S: Final = 10.0
+"""At the end of a run, in which the camera has to be back after what went wrong."""
+FAR_TOO_LONG_M: Final = 0.5
+"""Excess of a range out of sight that has to end without weight."""
+NO_WEIGHT: Final = 0.1
+"""Below it a range has none that matters."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +59,10 @@ class Case:
     run: Run
     has_ranges: bool = True
     has_loops: bool = True
+    is_threaded: bool = False
+    """Mapping beside tracking, as a user on the way would have it."""
+    is_kept: bool = True
+    """Whether all images are rendered before the run: they are not timed, but in memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,14 +78,18 @@ class Recorded:
     """Least and largest distance of an anchor from the middle of the path, level."""
     height_m: tuple[float, float]
     """The same upwards; cameras are level at first, so up is -y."""
+    lever_sigma_m: float = 0.0
+    """Of the place, beside the camera, that the truth is of and ranges are simulated from."""
 
 
 NLOS: Final = RangeFaults(nlos_share=0.3)
+HALF: Final = RangeFaults(nlos_share=0.5)
 _KITCHEN: Final = ("kitchen", (1.5, 3.0), (0.5, 1.5))
 _KITTI: Final = ("kitti07", (30.0, 60.0), (4.0, 8.0))
-RECORDED: Final[Mapping[str, Recorded]] = {
+_ANCHORS: Final = ("no ranges", "one anchor", "", "three anchors")
+_RECORDED: Final[Mapping[str, Recorded]] = {
     f"{name}-{n}" if n else f"{name}-mono": Recorded(
-        f"{words}, {('no ranges', 'one anchor', '', 'three anchors')[n]}", place[0], n, *place[1:]
+        f"{words}, {_ANCHORS[n]}", place[0], n, *place[1:]
     )
     for name, words, place in (
         ("kitchen", "7-Scenes kitchen", _KITCHEN),
@@ -80,11 +97,30 @@ RECORDED: Final[Mapping[str, Recorded]] = {
     )
     for n in (0, 1, 3)
 }
-"""By name."""
+RECORDED: Final[Mapping[str, Recorded]] = {
+    **_RECORDED,
+    **{
+        f"{name}-arm": replace(
+            _RECORDED[name],
+            about=f"{_RECORDED[name].about}, lever arm to be found",
+            lever_sigma_m=sigma,
+        )
+        for name, sigma in (("kitchen-1", 0.05), ("kitchen-3", 0.05), ("kitti-1", 0.5))
+    },
+}
+"""By name; with ``-arm`` what the truth is a path of, from which ranges are simulated, is not taken
+for the camera: it may be elsewhere on the car, or on the sensor in the hand."""
 CASES: Final[Mapping[str, Case]] = {
     "room": Case("room, one anchor", Run("room")),
     "room-mono": Case("room, no ranges", Run("room"), has_ranges=False),
     "room-nlos": Case("room, one anchor, 30 % NLOS", Run("room", ranges=NLOS)),
+    "room-half": Case("room, one anchor, 50 % NLOS", Run("room", ranges=HALF)),
+    "room-threads": Case(
+        "room, one anchor, mapping beside tracking", Run("room"), is_threaded=True
+    ),
+    "room-long": Case(
+        "room, one anchor, 2000 images", Run("room", duration_s=99.95), is_kept=False
+    ),
     "room-covered": Case(
         "room, one anchor, the lens covered for 2 s",
         Run("room", images=ImageFaults(covered_s=(30.0, 32.0))),
@@ -140,22 +176,72 @@ def case_of(name: str) -> Case:
 def trial(key: Key) -> Row:
     """Do one run; the key is the name of a case, a seed, and how long, s (0: as the case says)."""
     name, seed, duration_s = str(key[0]), int(key[1]), float(key[2])
+    simulated = None
     if name in RECORDED:
-        sequence, has_loops = recorded(RECORDED[name], seed, duration_s), True
+        case = Case("", Run())
+        sequence = recorded(RECORDED[name], seed, duration_s)
+        images = [sequence.images(k) for k in range(len(sequence))]
+        sequence = replace(sequence, images=images.__getitem__)
     else:
         case = case_of(name)
         asked = replace(case.run, seed=seed, duration_s=duration_s or case.run.duration_s)
-        sequence, has_loops = simulate(asked).sequence, case.has_loops
+        simulated = simulate(asked)
+        sequence = simulated.sequence
+        if case.is_kept:
+            sequence = replace(sequence, images=_rendered_before(asked, sequence))
         if not case.has_ranges:
             sequence = replace(sequence, ranges=screened_ranges([], [], []))
-    images = [sequence.images(k) for k in range(len(sequence))]  # rendering is not timed
-    sequence = replace(sequence, images=lambda k: images[k])
-    n_corners = SMALL_CORNERS if name.endswith("-small") else VisualSettings().n_corners
-    settings = VisualSettings(n_corners=n_corners, loops=LoopSettings(is_on=has_loops))
-    begin = time.process_time()
+    settings = VisualSettings(
+        n_corners=SMALL_CORNERS if name.endswith("-small") else VisualSettings().n_corners,
+        loops=LoopSettings(is_on=case.has_loops),
+        is_deterministic=not case.is_threaded,
+    )
+    begin, wall = time.process_time(), time.perf_counter()
     result = run(sequence, settings)
-    cpu_s = time.process_time() - begin
-    return {**_errors(sequence, result), **_loops(sequence, result), "cpu_s": cpu_s}
+    row = {"cpu_s": time.process_time() - begin, "wall_s": time.perf_counter() - wall}
+    tracking = result.timing_s.get("tracking", np.zeros(1))
+    row |= {
+        "rate_hz": len(sequence) / row["wall_s"],
+        "tracking_p99_s": float(np.percentile(tracking, 99)),
+        "peak_mib": _peak_mib(),
+        **_errors(sequence, result),
+        **_loops(sequence, result),
+    }
+    return row if simulated is None else row | _weights(simulated, result)
+
+
+def _rendered_before(asked: Run, sequence: Sequence) -> ImageOf:
+    """Return a simulated run's images, each rendered already; what is wrong with them is not."""
+    faults = asked.images
+    plain = replace(faults, covered_s=(0.0, 0.0), dropped_share=0.0)
+    bare = replace(
+        asked, n_anchors=0, ranges=RangeFaults(), images=plain, vehicle=None, range_scale_share=0.0
+    )
+    made = _rendered(bare)
+
+    def image(index: int) -> NDArray[np.uint8]:
+        time_s = float(sequence.time_s[index])
+        if faults.covered_s[0] <= time_s < faults.covered_s[1]:
+            return sequence.images(index)
+        return np.asarray(made[round(time_s * asked.rate_hz)])
+
+    return image
+
+
+@lru_cache(maxsize=1)
+def _rendered(asked: Run) -> NDArray[np.uint8]:
+    """Return all images (N, H, W) of a run; runs of one path that follow each other share them."""
+    sequence = simulate(asked).sequence
+    return np.stack([sequence.images(k) for k in range(len(sequence))])
+
+
+def _peak_mib() -> float:
+    """Return the most memory that this process has had, MiB; NaN where the system does not say."""
+    status = Path("/proc/self/status")
+    if not status.exists():
+        return float("nan")
+    lines = [x for x in status.read_text(encoding="utf-8").splitlines() if x.startswith("VmHWM")]
+    return float(lines[0].split()[1]) / 1024.0 if lines else float("nan")
 
 
 def data_folder() -> Path:
@@ -173,6 +259,7 @@ def recorded(case: Recorded, seed: int, duration_s: float = 0.0) -> Sequence:
     middle = 0.5 * (path.min(axis=0) + path.max(axis=0))
     anchors = middle + np.stack([away * np.cos(turn), -up, away * np.sin(turn)], axis=1)
     sequence = with_simulated_ranges(sequence, anchors, seed)
+    sequence = replace(sequence, lever_arm_sigma_m=case.lever_sigma_m)
     if not duration_s:
         return sequence
     kept = sequence.time_s < sequence.time_s[0] + duration_s
@@ -185,6 +272,8 @@ def _errors(sequence: Sequence, result: VisualResult) -> dict[str, Any]:
     row: dict[str, Any] = {
         "verdict": found.verdict.name,
         "tracked": float(np.mean(tracked)),
+        "tracked_last": float(np.mean(tracked[result.time_s > result.time_s[-1] - LAST_S])),
+        "n_key_frames": len(result.map.time_s),
         "n_images": len(result.time_s),
         "metric_m": np.nan,
         "similar_m": np.nan,
@@ -200,6 +289,26 @@ def _errors(sequence: Sequence, result: VisualResult) -> dict[str, Any]:
         row["started_s"] = float(result.ranging.started_s - result.time_s[0])
         row["scale_sigma"] = float(result.ranging.sigma_log_scale)
         row["clock_s"] = float(result.ranging.clock_s)
+    return row
+
+
+def _weights(simulated: Simulated, result: VisualResult) -> dict[str, Any]:
+    """Return how many ranges that are far too long end without weight, and the others' mean."""
+    sequence, row = simulated.sequence, {"nlos_dropped": np.nan, "clear_weight": np.nan}
+    truth, anchors, ranges = sequence.truth, sequence.anchor_truth_m, sequence.ranges
+    if result.ranging is None or not len(result.ranging.weight) or truth is None:
+        return row
+    assert anchors is not None
+    place = true_places(truth, ranges.time_s + result.ranging.clock_s)
+    away = np.linalg.norm(place - anchors[ranges.anchor], axis=1)
+    excess = ranges.range_m - away - simulated.bias_m
+    known = np.isfinite(result.ranging.weight)
+    long = known & simulated.is_nlos & (excess > FAR_TOO_LONG_M)
+    clear = known & ~simulated.is_nlos
+    if long.any():
+        row["nlos_dropped"] = float(np.mean(result.ranging.weight[long] < NO_WEIGHT))
+    if clear.any():
+        row["clear_weight"] = float(np.mean(result.ranging.weight[clear]))
     return row
 
 

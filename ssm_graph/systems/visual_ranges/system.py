@@ -78,7 +78,9 @@ class _Run:
         self.metric = None
         if len(sequence.ranges) or sequence.vehicle.has_aids:
             lever = np.array(sequence.lever_arm_m)
-            self.metric = Metric(sequence.ranges, lever, sequence.vehicle)
+            self.metric = Metric(
+                sequence.ranges, lever, sequence.vehicle, lever_sigma_m=sequence.lever_arm_sigma_m
+            )
         self.loops = LoopFinder(self.camera, settings.loops)
         self.pool = None if settings.is_deterministic else ThreadPoolExecutor(1)
         self.job: tuple[Image, Tracks, Future[Tracks]] | None = None
@@ -105,6 +107,8 @@ class _Run:
             self.pool.shutdown()
         if self.settings.has_final_adjustment and self.world.n_frames > 2:
             with self.timed("last adjustment"):
+                if self.metric is not None:
+                    self.metric.ranging.check_again()
                 self.adjust_all()
                 self.follow_back()
                 self.refine_frames()

@@ -74,6 +74,8 @@ def judged(result: VisualResult) -> Judged:
         )
     if ranging.state is StartState.WITHOUT_RANGES:
         faults += [ranging.state.value, *ranging.reasons]
+    if ranging.vehicle is not None and ranging.vehicle.contradiction:
+        faults.append(ranging.vehicle.contradiction)
     if ranging.state is StartState.COARSE:
         faults.append(StartRules().coarse(ranging.sigma_log_scale))
     open_ones = [a.name for a in ranging.anchors if a.state is AnchorState.AMBIGUOUS]

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from ssm_graph.systems.visual_ranges.range_fit import Problem, Solution, solution, with_sigma
+from ssm_graph.systems.visual_ranges.range_fit import Problem, Solution, solution
 from ssm_graph.systems.visual_ranges.weights import robust_rms
 
 WIDENINGS: Final = 8
@@ -26,7 +26,7 @@ def widened(problem: Problem, best: Solution) -> Problem:
     for j in range(problem.n_anchors):
         own = problem.places.anchor == j
         sigma[own] = np.fmax(sigma[own], robust_rms(best.error[own]))
-    problem = with_sigma(problem, sigma)
+    problem = replace(problem, places=problem.places._replace(sigma_m=sigma))
     for _ in range(WIDENINGS):
         if best.drift_square < WIDER:
             break

@@ -20,6 +20,7 @@ from ssm_graph.systems.visual_ranges.path_file import PathAsItComes
 from ssm_graph.systems.visual_ranges.ranges import screened_ranges
 from ssm_graph.systems.visual_ranges.ranging import Anchor, AnchorState, RangingResult
 from ssm_graph.systems.visual_ranges.ranging_result import VehicleResult
+from ssm_graph.systems.visual_ranges.recording import write_recording
 from ssm_graph.systems.visual_ranges.result import FrameNow, FrameState, MapSnapshot, VisualResult
 from ssm_graph.systems.visual_ranges.sequence import PathTruth, Sequence
 from ssm_graph.systems.visual_ranges.similarity3 import Sim3
@@ -153,12 +154,27 @@ def test_files_of_an_answer(tmp_path: Path) -> None:
     assert summary["against_truth"]["anchor_error_m"] == [pytest.approx(0.3)]
 
 
+def test_a_recording_for_rerun(tmp_path: Path) -> None:
+    """What the viewer is given: every pose, the key frames' images, anchors, ranges, events."""
+    reader = pytest.importorskip("rerun.chunk").RrdReader
+    sequence, result = made()
+    write_recording(tmp_path / "recording.rrd", sequence, result)
+    chunks: dict[str, int] = {}
+    for chunk in reader(tmp_path / "recording.rrd").stream().to_chunks():
+        name = str(chunk.entity_path)
+        chunks[name] = chunks.get(name, 0) + chunk.num_rows
+    assert chunks["/map/camera"] == N + 1
+    assert chunks["/map/camera/image"] == len(result.map.image)
+    assert chunks["/ranges/weight/A"] == N
+    assert {"/map/points", "/map/path", "/map/anchors/A", "/events"} <= set(chunks)
+
+
 def test_an_answer_by_the_vehicle_alone(tmp_path: Path) -> None:
     """Without any range: metres, READY, and the vertical in the files."""
     sequence, result = made()
     none, own = np.zeros(0), result.ranging
     told = VehicleResult(
-        np.array([0.0, 0.8, 0.6]), 1e-6 * np.eye(2), 3.0, SCALE, 0.004, np.nan, np.nan
+        np.array([0.0, 0.8, 0.6]), 1e-6 * np.eye(2), 3.0, SCALE, 0.004, np.nan, np.nan, ""
     )
     own = replace(
         own, anchors=(), error_m=none, weight=none, anchor_of=np.zeros(0, np.intp), vehicle=told
@@ -177,6 +193,9 @@ def test_an_answer_by_the_vehicle_alone(tmp_path: Path) -> None:
     assert answer["vehicle"]["down_map_axes"] == [0.0, 0.8, 0.6]
     assert answer["vehicle"]["range_unit_m"] is None
     assert any("down is 0.000, 0.800, 0.600" in line for line in lines(result, found, off))
+    doubted = replace(own, vehicle=replace(told, contradiction="the DVL against anchor A"))
+    found = judged(replace(result, ranging=doubted))
+    assert (found.verdict, found.reasons) == (Verdict.DOUBTFUL, ("the DVL against anchor A",))
     own = replace(own, state=StartState.WITHOUT_RANGES, reasons=("residuals of A",))
     found = judged(replace(result, ranging=own))
     assert found.verdict is Verdict.DOUBTFUL

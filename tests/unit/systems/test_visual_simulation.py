@@ -17,6 +17,7 @@ from ssm_graph.systems.visual_ranges.simulate import (
     ImageFaults,
     Run,
     axes,
+    corridor_path,
     room_path,
     simulate,
 )
@@ -48,6 +49,18 @@ def test_two_views_agree_on_the_points_of_the_walls() -> None:
     correlation = np.corrcoef(grey[0], grey[1])[0, 1]
     assert correlation > 0.8
     assert np.corrcoef(grey[0], np.roll(grey[1], 1))[0, 1] < 0.4
+
+
+def test_compiled_and_numpy_draw_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To rounding in single precision, walls near and far, at a slant and in the corners."""
+    world, path = corridor(3, texel_m=TEXEL_M), corridor_path(3)
+    R_wc, p_w = axes(path, np.array([3.0])), path.place(np.array([3.0]))
+    drawn = []
+    for chosen in ("1", "0"):
+        monkeypatch.setenv("SSM_GRAPH_NUMBA", chosen)
+        drawn.append(render(world, SMALL_CAMERA, R_wc[0], p_w[0]))
+    assert np.abs(drawn[0] - drawn[1]).max() < 1e-3
+    assert drawn[0].std() > 5.0
 
 
 def test_the_corridor_looks_the_same_again() -> None:

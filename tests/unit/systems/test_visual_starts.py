@@ -24,7 +24,7 @@ from ssm_graph.systems.visual_ranges.range_fit import (
 )
 from ssm_graph.systems.visual_ranges.range_rows import known_spacing
 from ssm_graph.systems.visual_ranges.range_terms import FramePoses, RangeTerms, hang
-from ssm_graph.systems.visual_ranges.ranges import Ranges
+from ssm_graph.systems.visual_ranges.ranges import Ranges, screened_ranges
 from ssm_graph.systems.visual_ranges.ranging import Ranging
 from ssm_graph.systems.visual_ranges.ranging_result import AnchorState
 from ssm_graph.systems.visual_ranges.readers.starloc import read_starloc
@@ -87,6 +87,7 @@ def test_the_fit_has_the_right_derivatives() -> None:
     a, b, c, d = rng.normal(size=(4, n, 3))
     time = np.sort(rng.uniform(0.0, 30.0, n))
     places = Places(a, b, c, d, np.arange(n) % 2, rng.uniform(1, 5, n), np.full(n, 0.1), time)
+    places = places._replace(arm=0.3 * rng.normal(size=(n, 3, 3)))
     problem = problem_of(places, 2, RangeKernel(), drift=0.05, bias_walk_m=0.1)
     at = 0.3 * rng.normal(size=(2, problem.n_unknowns))
     _, J = residuals(problem, at)
@@ -151,6 +152,55 @@ def test_hung_ranges_fit_the_true_path() -> None:
     assert float(np.abs(found.error).max()) < 2e-3
     off = terms.linearise(R, t, UNIT_M, anchors=anchors, biases=np.zeros(2))
     assert float(np.abs(off.error).max()) > 2e-2
+
+
+def test_a_lever_arm_that_is_not_known_is_found() -> None:
+    """Taken as exact it bends the scale; found with the rest it is right within its sigma."""
+    arm = np.array([0.3, -0.1, 0.2])
+    faults = RangeFaults(lever_arm_m=(0.3, -0.1, 0.2))
+    made, frames, anchors = true_run(Run("room", 20, 30.0, texel_m=0.05, ranges=faults))
+    found = Ranging(made.ranges, np.zeros(3), lever_sigma_m=0.3)
+    until(found, frames, 30.0)
+    result = found.result()
+    assert result.has_scale
+    assert abs(np.log(result.scale / UNIT_M)) < 3.0 * result.sigma_log_scale < 0.05
+    assert np.linalg.norm(result.lever_error_m - arm) < 0.15
+    assert np.linalg.norm(result.anchors[0].place_m - anchors[0]) < 0.3
+    exact = Ranging(made.ranges, np.zeros(3))
+    until(exact, frames, 30.0)
+    assert not exact.result().lever_error_m.any()
+    assert abs(np.log(exact.scale / result.scale)) > 0.02
+    poses = np.arange(len(frames.R_cw[:601:5]))
+    moved, plain = found.further(poses), exact.further(poses)
+    assert moved is not None
+    assert plain is not None
+    rows = moved.rows(frames.R_cw[:601:5], frames.t_cw[:601:5], np.zeros(0)).error
+    assert np.median(np.abs(rows)) < 1.5
+
+
+def test_a_place_that_is_as_good_is_found_again_at_the_end() -> None:
+    """A path in a plane: the anchor's mirror image, once lost, is listed when all is searched."""
+    time = np.arange(0.0, 20.0, 0.1)
+    place = np.stack([3 * np.sin(time / 3), 2 * np.sin(time / 2), np.zeros_like(time)], 1)
+    anchor, noise = np.array([2.0, 1.0, 1.5]), 0.05 * np.random.default_rng(1).normal(size=200)
+    measured = np.linalg.norm(place - anchor, axis=1) + noise
+    ranges = screened_ranges(time + 0.01, ["A"] * 200, measured, np.full(200, 0.05))
+    eye = np.broadcast_to(np.eye(3), (200, 3, 3)).copy()
+    frames = FramePoses(time, eye, -place / UNIT_M, np.arange(200) // 5)
+    ranging = Ranging(ranges, np.zeros(3))
+    until(ranging, frames, 20.0)
+    assert ranging.result().anchors[0].state is AnchorState.AMBIGUOUS
+    ranging.anchors[0] = ranging.anchors[0]._replace(state=AnchorState.READY, alternatives=())
+    until(ranging, frames, 20.0)
+    assert not len(ranging.result().anchors[0].alternatives_m)
+    ranging.check_again()
+    until(ranging, frames, 20.0)
+    (found,) = ranging.result().anchors
+    assert found.state is AnchorState.AMBIGUOUS
+    places = np.array([found.place_m, *found.alternatives_m])
+    assert len(places) == 2
+    for z in (1.5, -1.5):
+        assert np.linalg.norm(places - [2.0, 1.0, z], axis=1).min() < 0.3
 
 
 def test_all_places_of_an_anchor_judge_a_loop() -> None:

@@ -243,6 +243,29 @@ def test_sound_speed_is_told_apart_from_the_scale_by_dead_reckoning_alone() -> N
     assert np.linalg.norm(result.anchors[0].place_m - true) < 0.4
 
 
+@pytest.mark.parametrize(("factor", "told"), [(1.0, ""), (1.1, "above"), (0.9, "below")])
+def test_a_dvl_that_the_only_anchor_contradicts_is_told(factor: float, told: str) -> None:
+    """The anchor's place could take the wrong scale up: the ranges alone speak against it."""
+    time, R, t, own = map_of(21, 120)
+    path, reckoning = bottom_path(21), own.dead_reckoning
+    assert reckoning is not None
+    wrong = replace(reckoning, position_m=factor * reckoning.position_m)
+    faults = RangeFaults(rate_hz=1.0, sigma_m=0.1, sound_speed_m_per_s=1485.0)
+    anchors = np.array([[9.0, -7.0, 1.8]])
+    raw, _, _ = simulated_ranges(faults, path.place, anchors, (0.0, float(time[-1])), 21)
+    vehicle = Vehicle(dead_reckoning=wrong, range_scale_share=0.01)
+    metric = Metric(at_the_anchor(raw, 1500.0)[0], np.zeros(3), vehicle)
+    metric.update(frames_of(time, R, t), R, t, time)
+    result = metric.result()
+    assert result.has_scale
+    assert result.vehicle is not None
+    said = result.vehicle.contradiction
+    assert bool(said) == bool(told)
+    if told:
+        assert f"% {told} that of the ranges to anchor A0 alone" in said
+        assert "dead reckoning (DVL)" in said
+
+
 def test_ranges_that_contradict_themselves_are_left_out_and_told() -> None:
     """The vehicle's scale is right without them, and yet the answer is not called sound."""
     time, R, t, own = map_of(6, 160)

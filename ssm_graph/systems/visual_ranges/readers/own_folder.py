@@ -74,6 +74,7 @@ RANGE_KEYS: Final[Mapping[str, Key]] = {
     "lever_arm_m": Key(
         shape=(3,), low=-10.0, high=10.0, required=False, hint="camera to antenna, metres"
     ),
+    "lever_arm_sigma_m": optional_key("", 1e-3, 5.0, "0.05 by eye, left out where measured"),
     "anchors": _TEXT,
     "travel": _TEXT,
     "sound_speed_m_per_s": optional_key("", 1000.0, 2000.0, "1500 in the sea"),
@@ -128,6 +129,7 @@ def read_own_folder(folder: Path, options: ReadOptions) -> Sequence:
         places,
         (*notes, *ranges.notes),
         read_vehicle(folder, sections, share),
+        sections["ranges"].number("lever_arm_sigma_m") if "ranges" in sections else 0.0,
     )
 
 
@@ -290,6 +292,8 @@ def write_own_folder(folder: Path, sequence: Sequence) -> Iterator[int]:
     ranges = sequence.ranges
     if len(ranges):
         sections["ranges"] = {"file": "ranges.csv", "lever_arm_m": list(sequence.lever_arm_m)}
+        if sequence.lever_arm_sigma_m:
+            sections["ranges"]["lever_arm_sigma_m"] = sequence.lever_arm_sigma_m
         share = sequence.vehicle.range_scale_share
         if share:
             sections["ranges"]["sound_speed_sigma_m_per_s"] = share * SOUND_SPEED
