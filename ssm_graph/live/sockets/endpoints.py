@@ -5,6 +5,7 @@ What is bound is bound to this computer only, 127.0.0.1, unless another interfac
 
 from __future__ import annotations
 
+import errno
 import ipaddress
 import re
 import selectors
@@ -239,3 +240,21 @@ def _is_ipv4(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def caller(client: socket.socket) -> tuple[str, str]:
+    """Return who has called, for people, and the host; one that is gone already has none."""
+    try:
+        host, port = client.getpeername()[:2]
+    except OSError:
+        return "a client that is gone", ""
+    return f"client {host}:{port}", host
+
+
+def fault_of(sock: socket.socket) -> int:
+    """Return an error of a socket that says it is connected: lost again, or a port to itself."""
+    try:
+        is_itself = sock.getpeername() == sock.getsockname()
+    except OSError as error:
+        return error.errno or errno.ENOTCONN
+    return errno.ECONNREFUSED if is_itself else 0

@@ -109,11 +109,13 @@ class Feed:
         self._rate_hz, self._marked_s, self._n_marked = 0.0, -math.inf, 0
         self._altitude_m = math.nan
 
-    def channel(self, now: Now, caller: str = "", host: str = "") -> Channel:
-        """Return the begin of a connection; of one that others begin, with whom and from where."""
-        where = caller or self.address
-        place = Place(f"{self.name}, {where}", host and f"{self.name} {host}")
-        return Channel(self._make_decoder(), now, place)
+    def channel(self, now: Now, place: Place | None = None) -> Channel:
+        """Return the begin of a connection; of one that others begin, from where."""
+        return Channel(self._make_decoder(), now, place or self.place(self.address))
+
+    def place(self, where: str, host: str = "") -> Place:
+        """Return a place of this source; of one that others begin, with their host."""
+        return Place(f"{self.name}, {where}", host and f"{self.name} {host}")
 
     def take(self, channel: Channel, data: bytes, now: Now) -> list[Message]:
         """Return the messages that these bytes complete and that are not too many."""

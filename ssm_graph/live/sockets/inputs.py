@@ -16,11 +16,14 @@ from ssm_graph.live.sockets.endpoints import (
     Endpoint,
     Listener,
     bound,
+    caller,
+    fault_of,
     let_go,
     received,
     resolve,
 )
 from ssm_graph.live.sockets.feed import AHEAD_S, Channel, Feed
+from ssm_graph.live.sockets.places import Place
 from ssm_graph.mission.navigation import Severity
 from ssm_graph.mission.run_status import LinkState, SourceStatus
 from ssm_graph.sensors.messages import Message, Readings
@@ -28,7 +31,7 @@ from ssm_graph.sensors.messages import Message, Readings
 YOUNG_S: Final = 2.0
 """A client that has sent no sound message for so long makes room for another one."""
 MAX_SENDERS: Final = 64
-"""Of datagrams, that are told apart."""
+"""Of datagrams, that are told apart, and that are remembered of those that spoke once."""
 MAX_DATAGRAMS: Final = 512
 """Read of one source before the others have their turn."""
 
@@ -228,7 +231,7 @@ class TcpClientInput(Input):
             self._failed(os.strerror(code), now)
 
     def _answered(self, sock: socket.socket, now: Now) -> None:
-        code = sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR) or _fault_of(sock)
+        code = sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR) or fault_of(sock)
         if code:
             self._failed(os.strerror(code), now)
             return
@@ -279,7 +282,7 @@ class TcpServerInput(Input):
         if client is not None:
             if silent and len(self._reading) >= self.feed.limits.max_clients:
                 messages = self._lose(silent, now, "it sent nothing sound and made room")
-            self._read_from(client, self.feed.channel(now, *_caller(client)))
+            self._read_from(client, self.feed.channel(now, self.feed.place(*caller(client))))
         return messages
 
     def tick(self, now: Now) -> list[Message]:
@@ -316,8 +319,10 @@ class UdpInput(Input):
         self._socket = bound(endpoint)
         self.port = int(self._socket.getsockname()[1])
         self._all: Channel | None = None
-        """Stands for all senders, each of which has a channel of its own"""
+        """Stands for all senders, and is that of those that spoke once"""
+        self._once: dict[str, Place] = {}
         self._senders: dict[str, Channel] = {}
+        """Each of the others has a channel of its own"""
         self._is_silent = False
         self._free_s: dict[str, float] = {}
         self._behind_s = 0.0
@@ -361,16 +366,29 @@ class UdpInput(Input):
         return messages
 
     def _channel_of(self, sender: str, now: Now) -> Channel:
-        """Return the channel of a sender; of too many the newest gives way."""
+        """Return the channel of a sender; of too many the newest gives way.
+
+        Those that speak for the first time share one: a program that opens a socket for every
+        datagram is one instrument, and its decoder has to know what came before.
+        """
         assert self._all is not None
-        if sender not in self._senders:
-            if len(self._senders) >= MAX_SENDERS:
-                _, last = self._senders.popitem()
-                last.place.leave()
-            channel = self._senders[sender] = self.feed.channel(now, f"sender {sender}", sender)
-            channel.heard_s = -math.inf
-            channel.is_stale = self._all.is_stale
-        return self._senders[sender]
+        if sender in self._senders:
+            return self._senders[sender]
+        place = self._once.pop(sender, None)
+        if place is None:
+            if len(self._once) >= MAX_SENDERS:
+                self._once.pop(next(iter(self._once)))
+            place = self.feed.place(f"sender {sender}", sender)
+            self._once[sender] = self._all.place = place
+            return self._all
+        if len(self._senders) >= MAX_SENDERS:
+            _, last = self._senders.popitem()
+            last.place.leave()
+        channel = self._senders[sender] = self.feed.channel(now, place)
+        channel.heard_s, channel.is_stale = -math.inf, self._all.is_stale
+        if self._all.place is place:  # nobody else has spoken since
+            channel.decoder, self._all.decoder = self._all.decoder, channel.decoder
+        return channel
 
     def stood_still(self, span_s: float) -> None:
         """Have nobody pay for the time in which this process did not listen."""
@@ -417,21 +435,3 @@ class UdpInput(Input):
             self._is_silent = True
             self.feed.tell("source_silent", f"{self.feed.address}: {why}", Severity.WARNING)
         return []
-
-
-def _caller(client: socket.socket) -> tuple[str, str]:
-    """Return who has called, for people, and the host; one that is gone already has none."""
-    try:
-        host, port = client.getpeername()[:2]
-    except OSError:
-        return "a client that is gone", ""
-    return f"client {host}:{port}", host
-
-
-def _fault_of(sock: socket.socket) -> int:
-    """Return an error of a socket that says it is connected: lost again, or a port to itself."""
-    try:
-        is_itself = sock.getpeername() == sock.getsockname()
-    except OSError as error:
-        return error.errno or errno.ENOTCONN
-    return errno.ECONNREFUSED if is_itself else 0

@@ -25,7 +25,10 @@ WAITS_S: Final = 1.0
 MOST_WAITING: Final = 1000
 """More are not of a client that has called again."""
 MOST_PLACES: Final = 16
-"""Of one kind of message that are remembered; the newest gives way, for the first ones count."""
+"""Of one kind of message that are remembered."""
+SETTLED: Final = 3
+"""A place that was heard at so many moments keeps others out: fewer may be of sockets that are
+opened for every datagram, of which one or the other has by chance the port of one before."""
 
 
 @dataclass(slots=True)
@@ -66,13 +69,20 @@ class _Voice:
     interval_s: float = 0.0
     n_heard: int = 0
     """Moments at which it was heard."""
-    waits_s: float = -math.inf
-    """When it was first not heard since the one before it was."""
+    spoke_s: float = -math.inf
+    """When it spoke last, heard or not."""
+    missed_s: float = math.inf
+    """When others first spoke in vain since it was heard."""
     met_s: float = math.inf
     """When it was first not heard at all."""
     waiting: list[Message] = field(default_factory=list)
     is_strange: bool = False
     """Whether it spoke for long while another one was heard."""
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether it keeps others out."""
+        return self.n_heard >= SETTLED
 
     @property
     def patience_s(self) -> float:
@@ -86,7 +96,8 @@ class _Voice:
                 since_s = min(steady_s - self.heard_s, LONGEST_INTERVAL_S)
                 self.interval_s = max(since_s, 0.9 * self.interval_s)
             self.n_heard += 1
-        self.heard_s, self.met_s, self.is_strange = steady_s, math.inf, False
+        self.heard_s, self.is_strange = steady_s, False
+        self.met_s = self.missed_s = math.inf
         waiting, self.waiting = self.waiting, []
         return [*waiting, message]
 
@@ -105,11 +116,16 @@ class _Voice:
         """Speak from another place: the same client has called again."""
         self.place, self.waiting = place, waiting
 
-    def waited_s(self, other: _Voice, steady_s: float) -> float:
-        """Return for how long it has spoken in vain since the other one was heard, s."""
-        if self.waits_s < other.heard_s:
-            self.waits_s = steady_s
-        return steady_s - self.waits_s
+    def is_missed(self, steady_s: float) -> bool:
+        """Return whether it has fallen silent for others, one of which speaks now.
+
+        They have to have spoken in vain for so long, whoever they were: where nobody has looked for
+        a while, what comes first says nothing of who is silent. Of a connection that is gone
+        nothing more can come.
+        """
+        self.missed_s = min(self.missed_s, steady_s)
+        since_s = self.heard_s if self.place.is_left else self.missed_s
+        return steady_s - since_s >= self.patience_s
 
 
 class Places:
@@ -121,11 +137,12 @@ class Places:
     def hear(self, place: Place, message: Message, steady_s: float) -> Heard:
         """Return what may pass now that a message has come from a place, and what is refused.
 
-        A sender that spoke once only, as one does that opens a socket for every datagram, keeps
+        A sender that spoke once or twice, as one does that opens a socket for every datagram, keeps
         nobody out.
         """
         voice, before = self._voice(place, type(message))
-        if before is None or self._is_silent(before, voice, steady_s):
+        voice.spoke_s = steady_s
+        if before is None or before.is_missed(steady_s):
             return Heard(voice.hear(message, steady_s))
         n_refused = voice.wait(message, steady_s, before.place)
         return Heard([], n_refused, before.place if n_refused else None)
@@ -140,15 +157,17 @@ class Places:
         others = self._voices.get(kind, [])
         own = next((voice for voice in others if voice.place is place), None)
         newest = max(others, key=lambda voice: voice.heard_s, default=None)
-        return own is newest or newest is None or newest.n_heard < 2
+        return own is newest or newest is None or not newest.is_settled
 
     def _voice(self, place: Place, kind: type[Message]) -> tuple[_Voice, _Voice | None]:
         """Return the voice of a place, and that which was heard last of those before it."""
         voices = self._voices.setdefault(kind, [])
         at = next((k for k, voice in enumerate(voices) if voice.place is place), len(voices))
         if at == len(voices):
-            at = min(at, MOST_PLACES - 1)
-            voices[at:] = [_Voice(place)]
+            if at == MOST_PLACES:
+                self._forget_one(voices)
+            at = len(voices)
+            voices.append(_Voice(place))
         if not voices[at].is_strange:
             others = (voice.place for voice in voices[:at])
             left = (k for k, one in enumerate(others) if one.is_left and one.is_of_host(place))
@@ -156,16 +175,11 @@ class Places:
             if before < at:
                 voices[before].follow(place, voices.pop(at).waiting)
                 at = before
-        known = (voice for voice in voices[:at] if voice.n_heard > 1)
+        known = (voice for voice in voices[:at] if voice.is_settled)
         return voices[at], max(known, key=lambda voice: voice.heard_s, default=None)
 
     @staticmethod
-    def _is_silent(before: _Voice, voice: _Voice, steady_s: float) -> bool:
-        """Return whether a voice that was heard first has fallen silent for another one.
-
-        That one has to have waited for so long: where nobody has looked for a while, what comes
-        first says nothing of who is silent. Of a connection that is gone nothing more can come.
-        """
-        if before.place.is_left:
-            return steady_s - before.heard_s >= before.patience_s
-        return voice.waited_s(before, steady_s) >= before.patience_s
+    def _forget_one(voices: list[_Voice]) -> None:
+        """Forget who spoke longest ago of those that keep nobody out, else the newest."""
+        passing = [k for k, voice in enumerate(voices) if not voice.is_settled]
+        del voices[min(passing, key=lambda k: voices[k].spoke_s, default=-1)]
