@@ -56,7 +56,7 @@ With --in-map, only trajectory.tum: where in an earlier map each image was taken
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
-    parser.add_argument("recording", type=Path, metavar="RUN", help="folder, video or bag")
+    parser.add_argument("source", type=Path, metavar="RUN", help="folder, video or bag")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="result folder")
     parser.add_argument("--overwrite", action="store_true", help="write over earlier results")
     parser.add_argument("--ranges", type=Path, metavar="FILE", help="time, anchor, range (, sigma)")
@@ -114,7 +114,7 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
     if arguments.recording:
         rerun()  # said before the work, not after it
     check_is_free(arguments.out, may_overwrite=arguments.overwrite)
-    sequence = read_sequence(arguments.recording, _options(arguments))
+    sequence = read_sequence(arguments.source, _options(arguments))
     if arguments.no_ranges:
         sequence = _without_ranges(sequence)
     if arguments.lever_arm_sigma_m is not None:

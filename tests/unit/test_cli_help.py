@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ssm_graph.cli.main import COMMANDS, GROUPS, ExitCode, build_parser, main
+from ssm_graph.cli.main import COMMANDS, GROUPS, ExitCode, build_parser, command_parser, main
 from ssm_graph.io.mission_folder.folder import write_mission
 from ssm_graph.report.clock import clocked
 from ssm_graph.report.mission.figure import MARKS_ACROSS, _apart
@@ -36,6 +36,14 @@ def test_help_names_every_command_once(capsys: pytest.CaptureFixture[str]) -> No
     assert "\n  oracle " in others
     assert main(["help", "smoth"]) == ExitCode.USAGE
     assert "did you mean 'smooth'" in capsys.readouterr().err
+
+
+def test_an_option_and_a_word_have_values_of_their_own() -> None:
+    """One of the same name would be taken for the other."""
+    for name in COMMANDS:
+        actions = command_parser(name)._actions
+        words = {action.dest for action in actions if not action.option_strings}
+        assert words.isdisjoint(action.dest for action in actions if action.option_strings), name
 
 
 def test_quiet_leaves_errors(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
