@@ -77,6 +77,14 @@ class Channel:
         self.heard_s = max(self.heard_s, channel.heard_s)
         self.fed_s = max(self.fed_s, channel.fed_s)
 
+    def speak_for(self, place: Place) -> None:
+        """Be that of another place from now on."""
+        self.place = place
+
+    def swap_decoders(self, channel: Channel) -> None:
+        """Give another one what was begun here, for what that one has begun."""
+        self.decoder, channel.decoder = channel.decoder, self.decoder
+
     def catch_up(self) -> None:
         """All that waited has been read."""
         self.is_stale = False

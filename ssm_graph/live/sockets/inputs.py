@@ -379,7 +379,8 @@ class UdpInput(Input):
             if len(self._once) >= MAX_SENDERS:
                 self._once.pop(next(iter(self._once)))
             place = self.feed.place(f"sender {sender}", sender)
-            self._once[sender] = self._all.place = place
+            self._once[sender] = place
+            self._all.speak_for(place)
             return self._all
         if len(self._senders) >= MAX_SENDERS:
             _, last = self._senders.popitem()
@@ -387,7 +388,7 @@ class UdpInput(Input):
         channel = self._senders[sender] = self.feed.channel(now, place)
         channel.heard_s, channel.is_stale = -math.inf, self._all.is_stale
         if self._all.place is place:  # nobody else has spoken since
-            channel.decoder, self._all.decoder = self._all.decoder, channel.decoder
+            self._all.swap_decoders(channel)
         return channel
 
     def stood_still(self, span_s: float) -> None:

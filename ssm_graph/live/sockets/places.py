@@ -96,13 +96,15 @@ class _Voice:
                 since_s = min(steady_s - self.heard_s, LONGEST_INTERVAL_S)
                 self.interval_s = max(since_s, 0.9 * self.interval_s)
             self.n_heard += 1
-        self.heard_s, self.is_strange = steady_s, False
+        self.heard_s = self.spoke_s = steady_s
+        self.is_strange = False
         self.met_s = self.missed_s = math.inf
         waiting, self.waiting = self.waiting, []
         return [*waiting, message]
 
     def wait(self, message: Message, steady_s: float, before: Place) -> int:
         """Have a message wait while it may be of the same client; return how many are refused."""
+        self.spoke_s = steady_s
         self.met_s = min(self.met_s, steady_s)
         is_long = steady_s - self.met_s > WAITS_S or len(self.waiting) >= MOST_WAITING
         self.is_strange = self.is_strange or is_long or not before.is_of_host(self.place)
@@ -141,7 +143,6 @@ class Places:
         nobody out.
         """
         voice, before = self._voice(place, type(message))
-        voice.spoke_s = steady_s
         if before is None or before.is_missed(steady_s):
             return Heard(voice.hear(message, steady_s))
         n_refused = voice.wait(message, steady_s, before.place)
