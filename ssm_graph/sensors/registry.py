@@ -26,10 +26,11 @@ INSTRUMENTS: Final[tuple[Instrument, ...]] = (
     RANGES,
     COMPASS,
     MAGNETOMETER,
-    FEATURES,
     AT_REST,
+    FEATURES,
 )
-"""In the order in which a folder has their tables, and a log counts them."""
+"""In the order in which a folder has their tables, and a log counts them: new ones come last, or
+older logs are counted wrongly."""
 BY_SECTION: Final[Mapping[str, Instrument]] = {one.section: one for one in INSTRUMENTS}
 BY_LOG: Final[Mapping[type, Instrument]] = {one.log: one for one in INSTRUMENTS}
 BY_MESSAGE: Final[Mapping[type[Message], Instrument]] = {
