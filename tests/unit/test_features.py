@@ -19,14 +19,18 @@ from factors.feature_sighting import (
 )
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array
+from ssm_graph.io.mission_folder.vehicle import vehicle_of
+from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.protocols.json_messages import decode_message, encode_message
 from ssm_graph.mission.mission import Aids
 from ssm_graph.sensors.features import FeatureLog, FeatureSighting
+from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.simulation import AidSettings, Grade, GrossErrors, SimulatedMission, SpiralRoute
 from ssm_graph.simulation.features import FeatureSettings
 from ssm_graph.smoothers.fixed_lag import FixedLagConfig, solve_fixed_lag
 from tests.aids_fixture import weights_of
 from tests.helpers import assert_consistent, assert_jacobians_match, rotation, simulated
+from tests.online_fixture import joined, run
 
 PLACES = ((5.0, 12.0, -27.0), (-22.0, -8.0, -26.0), (18.0, -30.0, -28.0), (-3.0, -33.0, -25.0))
 """Beside the spiral that the vehicle goes at 20 m of depth."""
@@ -132,6 +136,23 @@ def test_a_window_finds_them_as_it_goes() -> None:
     assert 0.3 < metrics.nees_position < 3.0
     assert newest.aids is not None
     assert np.median(weights_of(newest.aids, "feature")) > 0.5
+
+
+def test_live_answers_leave_them_out_and_say_so() -> None:
+    """They ask for no keyframes, and what says nothing is no aid that a position hangs on."""
+    sim = circling()
+    vehicle = vehicle_of(sim.mission)
+    cut = [one for one in messages_of(sim.mission) if one.time_s < 12.0]
+    late = [one for one in cut if isinstance(one, ImuSample | FeatureSighting) or one.time_s < 4.0]
+    without = [one for one in late if not isinstance(one, FeatureSighting)]
+    assert len(late) > len(without)
+    (newest, delayed, smoother), (expected, keyframes, _) = (
+        run(given, vehicle) for given in (late, without)
+    )
+    assert newest.since_aid_s == expected.since_aid_s > 7.0
+    np.testing.assert_array_equal(joined(delayed, "time_s"), joined(keyframes, "time_s"))
+    (event,) = (event for event in smoother.take_events() if event.kind == "not_used")
+    assert "[features]" in event.text
 
 
 def test_a_folder_and_messages_keep_all_of_it(tmp_path: Path) -> None:

@@ -156,6 +156,8 @@ class Aid(Table, ABC):
     """Whether each measurement has a weight, as every beam has; otherwise it counts in full"""
     asks_for_keyframes: ClassVar[bool] = False
     """Whether each of them asks for a keyframe of its own; see :meth:`times`"""
+    is_live: ClassVar[bool] = True
+    """Whether the live estimator uses them; otherwise they are in its log alone"""
 
     @classmethod
     def of(cls, aids: Aids, keyframes: Keyframes) -> Self | None:  # noqa: ARG003

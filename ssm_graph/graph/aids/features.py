@@ -46,6 +46,7 @@ class FeatureSightings(Aid):
     hint = "look at the numbers of the features, and at mounting and clock of the sonar"
     section = FeatureLog.SECTION
     asks_for_keyframes = True
+    is_live = False  # which features there are shows in the log alone, and variables begin with it
 
     feature: Indices
     """(M,) its number"""

@@ -50,7 +50,8 @@ class Buffers:
         }
         """By the section of the instrument."""
         self.imu, self.pings, self.fixes = (self.rows[one.section] for one in (IMU, DVL, GNSS))
-        sections = (kind.section.strip("[]") for kind in AIDS if kind.asks_for_keyframes)
+        asking = (kind for kind in AIDS if kind.asks_for_keyframes and kind.is_live)
+        sections = (kind.section.strip("[]") for kind in asking)
         self.asking = [self.fixes, *(self.rows[name] for name in sections if name in self.rows)]
         """Those whose readings ask for keyframes of their own, pings apart."""
         n_beams = vehicle.mount.n_beams

@@ -163,6 +163,6 @@ def aids_at(logs: Logs, keyframes: Keyframes) -> Iterator[Aid]:
         readings = replace(readings, sigma=readings.sigma * readings.white_share)
         yield DepthMeans.of_readings(readings, keyframe_s, frame).at(1)
     for kind in AIDS:
-        aid = kind.of(aids, keyframes)
+        aid = kind.of(aids, keyframes) if kind.is_live else None
         if aid is not None:
             yield aid.at(1)

@@ -20,7 +20,7 @@ from ssm_graph.live.estimator.keyframes import KeyframeMaker
 from ssm_graph.live.estimator.packing import pack_step, part_of, unpack_step
 from ssm_graph.live.estimator.recovery import ASTRAY_TIMES, Reserve, is_astray
 from ssm_graph.live.estimator.separation import IntegrityConfig
-from ssm_graph.live.estimator.start import Starter, not_calibrated, sensors_of_vehicle
+from ssm_graph.live.estimator.start import Starter, not_calibrated, not_used, sensors_of_vehicle
 from ssm_graph.live.estimator.tail import Tail
 from ssm_graph.live.estimator.watch import Watch
 from ssm_graph.mission.estimate import Found
@@ -186,6 +186,8 @@ class FixedLagSmoother:
         self._frame, self._begun_s = beginning.frame, beginning.begin_s
         for note in not_calibrated(self.vehicle):
             self._events.tell(beginning.time_s, Severity.INFO, "not_calibrated", note)
+        for note in not_used(self.vehicle):
+            self._events.tell(beginning.time_s, Severity.WARNING, "not_used", note)
         sensors = sensors_of_vehicle(self.vehicle, self._frame)
         first = Keyframe(beginning.time_s, sensors.beams)
         window = Window(sensors, self.config, first, beginning.moments)

@@ -238,6 +238,17 @@ def not_calibrated(vehicle: Vehicle) -> tuple[str, ...]:
     return taken_as_exact(_all_asked_for(vehicle).without(carried))
 
 
+def not_used(vehicle: Vehicle) -> tuple[str, ...]:
+    """Return the notes of what it has and answers after the start leave out."""
+    has = {log.SECTION for log in vehicle.aids}
+    return tuple(
+        f"{kind.section}: live answers do not use it, readings are kept in the log; "
+        "ssm-graph smooth uses them"
+        for kind in AIDS
+        if not kind.is_live and kind.section in has
+    )
+
+
 def sensors_of_vehicle(vehicle: Vehicle, frame: LocalFrame) -> Sensors:
     """Return what is the same at all keyframes."""
     at_rest = ImuLog(0.0, vehicle.imu_noise, np.ones(1), np.zeros((1, 3)), np.zeros((1, 3)))
