@@ -28,9 +28,10 @@ Convert a log. LOG is one of
   tables of any    CSV, Parquet, MAT, HDF5 (extra 'columns'), with --map map.toml, which says what
   columns          their columns are: ssm-graph template writes one to fill in, ssm-graph inspect
                    FILE --draft-map drafts one of a table
-  several files    inertial data in a table with the columns of imu.csv, or in any columns with
-                   --map, and recordings as above, with --vehicle: one mission on the clock of the
-                   IMU, the others moved by the turns they show
+  several files    inertial data in a table with the columns of imu.csv, in any columns with --map,
+                   or of an ArduPilot log, with its depths and fixes, and recordings as above, with
+                   --vehicle: one mission on the clock of the IMU, the others moved by the turns
+                   they show
 
 Of a ROS bag, topics are found by their type:
 
@@ -56,7 +57,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="LOG",
         nargs="+",
-        help="file or folder to convert; several are merged: an imu.csv and recordings of others",
+        help="file or folder to convert; several are merged: inertial data and recordings",
     )
     add_mission_output(parser)
     parser.add_argument(

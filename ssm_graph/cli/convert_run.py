@@ -44,6 +44,7 @@ ROS_OPTIONS = (
     *("vehicle", "topic", "body", "water_density", "atmosphere", "surface_height"),
     "beams_against",
 )
+ARDUPILOT_OPTIONS = ("vehicle", "water_density", "surface_height")
 
 
 def convert(arguments: argparse.Namespace, console: Console, errors: Console) -> bool:
@@ -89,14 +90,17 @@ def convert(arguments: argparse.Namespace, console: Console, errors: Console) ->
 def _refuse_ros_options(log: Path, arguments: argparse.Namespace, options: Iterable[str]) -> None:
     for name in options:
         if getattr(arguments, name) is not None:
+            too = name in ARDUPILOT_OPTIONS
             raise ConfigError(
-                f"--{name.replace('_', '-')} is for ROS bags, and {log} is none: {kind_of(log)}"
+                f"--{name.replace('_', '-')} is for ROS bags{' and logs of ArduPilot' * too}, and "
+                f"{log} is none: {kind_of(log)}"
             )
 
 
 def _merge(arguments: argparse.Namespace, console: Console, errors: Console) -> bool:
-    """Write the mission of an IMU's table and recordings of other instruments."""
-    _refuse_ros_options(arguments.log[0], arguments, ROS_OPTIONS[1:])
+    """Write the mission of inertial data and recordings of other instruments."""
+    own = ARDUPILOT_OPTIONS if any(map(is_ardupilot, arguments.log)) else ("vehicle",)
+    _refuse_ros_options(arguments.log[0], arguments, [o for o in ROS_OPTIONS if o not in own])
     if arguments.vehicle is None:
         raise ConfigError("several logs: expected  --vehicle FILE  with noise, mounting and place")
     vehicle, offset_s = read_vehicle(arguments.vehicle), arguments.clock_offset
@@ -105,7 +109,13 @@ def _merge(arguments: argparse.Namespace, console: Console, errors: Console) -> 
             raise DataError(f"{log}: expected a file, of an IMU or of one instrument")
     with ProgressDisplay(errors) as show:
         show.stage("reading and joining the logs")
-        found = merge_recordings(arguments.log, arguments.out, vehicle=vehicle, offset_s=offset_s)
+        found = merge_recordings(
+            arguments.log,
+            arguments.out,
+            vehicle=vehicle,
+            offset_s=offset_s,
+            ardupilot=_ardupilot_options(arguments),
+        )
     return _said(found, arguments, console)
 
 
@@ -116,12 +126,13 @@ def _said(found: Merged, arguments: argparse.Namespace, console: Console) -> boo
 
 
 def _from_ardupilot(log: Path, arguments: argparse.Namespace) -> Mission:
-    own = ("vehicle", "water_density", "surface_height")
-    _refuse_ros_options(log, arguments, [name for name in ROS_OPTIONS if name not in own])
-    density = _density(arguments)
+    _refuse_ros_options(log, arguments, [o for o in ROS_OPTIONS if o not in ARDUPILOT_OPTIONS])
     vehicle = None if arguments.vehicle is None else read_vehicle(arguments.vehicle)
-    options = ArduPilotOptions(density, arguments.surface_height)
-    return convert_ardupilot(log, vehicle=vehicle, options=options)
+    return convert_ardupilot(log, vehicle=vehicle, options=_ardupilot_options(arguments))
+
+
+def _ardupilot_options(arguments: argparse.Namespace) -> ArduPilotOptions:
+    return ArduPilotOptions(_density(arguments), arguments.surface_height)
 
 
 def _density(arguments: argparse.Namespace) -> float | None:

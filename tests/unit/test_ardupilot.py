@@ -23,6 +23,7 @@ from ssm_graph.mission.mission import Mission
 from ssm_graph.sensors.dvl import DvlMount
 from ssm_graph.simulation import scenario_config, simulate
 from ssm_graph.smoothers.mission import smooth
+from tests.water_linked_fixture import velocity_report
 
 BOOT_US = 12_000_000
 """The mission's zero on the vehicle's clock."""
@@ -152,6 +153,31 @@ def test_a_dataflash_log_becomes_its_mission(mission: Mission, log: bytes, tmp_p
     alone = convert_ardupilot(path)
     np.testing.assert_allclose(alone.dvl.mount.lever_arm_b, [0.2, 0.0, 0.0], atol=1e-6)
     assert any("consumer MEMS unit" in note for note in alone.notes)
+
+
+def test_beams_of_a_recording_beside_it(
+    mission: Mission, log: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The DVL's own pings count and no movements; depths and fixes are those of the vehicle."""
+    write_vehicle(tmp_path, replace(vehicle_of(mission), initial=None))
+    pings = zip(mission.dvl.time_s + UNIX, mission.dvl.speed, strict=True)
+    recording = tmp_path / "dvl.json"
+    recording.write_text("".join(f"{velocity_report(*one)}\n" for one in pings))
+    logs = [str(_file(tmp_path, log)), str(recording)]
+    words = ["--vehicle", str(tmp_path / "mission.toml"), "--out", str(tmp_path / "out")]
+    assert main(["convert", *logs, *words, "--surface-height", "12"]) == 0, capsys.readouterr().err
+    assert "VISO: movements left out" in " ".join(capsys.readouterr().out.split())
+    found = read_mission(tmp_path / "out")
+    np.testing.assert_array_equal(found.dvl.speed, mission.dvl.speed)
+    np.testing.assert_allclose(found.imu.time_s - UNIX, mission.imu.time_s, atol=2e-6)
+    assert mission.depth is not None
+    assert mission.gnss is not None
+    assert found.depth is not None
+    assert found.gnss is not None
+    np.testing.assert_allclose(found.depth.depth, mission.depth.depth, atol=2e-3)
+    assert len(found.gnss.time_s) == len(mission.gnss.time_s)
+    assert main(["convert", logs[1], logs[1], *words, "--overwrite"]) != 0
+    assert "or one log of ArduPilot, among the files, got 0" in capsys.readouterr().err
 
 
 def test_a_log_of_a_vehicle_with_beams_is_refused(

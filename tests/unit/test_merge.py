@@ -21,6 +21,7 @@ from ssm_graph.live.recorded.turns import clock_offset
 from ssm_graph.sensors.messages import Message
 from ssm_graph.simulation import CALM, SimulatedMission, SurveyRoute
 from tests.helpers import simulated
+from tests.water_linked_fixture import velocity_report
 
 AHEAD_S = 1_750_000_123.456
 """Of the DVL's clock before the IMU's."""
@@ -39,7 +40,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     mission = sim().mission
     write_mission(found / "mission", mission)
     pings = zip(mission.dvl.time_s, mission.dvl.speed, strict=True)
-    lines = [(one[0], velocity(*one)) for one in pings]
+    lines = [(t, velocity_report(t + AHEAD_S, speed)) for t, speed in pings]
     yaw_s = np.arange(1.0, 79.0, 0.2)
     heading = np.degrees(sim().truth_at(yaw_s).roll_pitch_heading[:, 2]) + 40.0
     noise = np.random.default_rng(3).normal(0.0, 0.3, len(yaw_s))
@@ -47,17 +48,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     text = "".join(f"{line}\n" for _, line in sorted(lines, key=lambda one: one[0]))
     (found / "dvl.json").write_text(text)
     return found
-
-
-def velocity(time_s: float, speed: np.ndarray) -> str:
-    """Return a report of the velocity."""
-    beams = [
-        {"id": k, "velocity": float(np.nan_to_num(v)), "beam_valid": bool(np.isfinite(v))}
-        for k, v in enumerate(speed)
-    ]
-    stamp = round(1e6 * (time_s + AHEAD_S))
-    kind = {"type": "velocity", "format": "json_v3", "velocity_valid": True}
-    return json.dumps({**kind, "transducers": beams, "time_of_validity": stamp})
 
 
 def local(time_s: float, yaw_deg: float) -> str:

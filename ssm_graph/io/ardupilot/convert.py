@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,6 +79,16 @@ def is_ardupilot(path: Path) -> bool:
     return is_dataflash(head) or is_telemetry(head)
 
 
+class ArduPilotLogs(NamedTuple):
+    """What a log holds, on one clock."""
+
+    logs: tuple[Any, ...]
+    """Of the IMU, of the DVL if it was asked for, of depth and fixes where there are any"""
+    labels: Mapping[str, str]
+    """By section, where it stands"""
+    notes: tuple[str, ...]
+
+
 def convert_ardupilot(
     log: Path, *, vehicle: Vehicle | None = None, options: ArduPilotOptions | None = None
 ) -> Mission:
@@ -96,19 +106,41 @@ def convert_ardupilot(
     vehicle : noise, lever arms, place; without it they are assumed, and notes say so.
     options : water and its surface.
     """
+    found = logs_of_ardupilot(log, vehicle=vehicle, options=options)
+    return mission_from(
+        found.logs, vehicle, source=log, labels=found.labels, notes=list(found.notes)
+    )
+
+
+def logs_of_ardupilot(
+    log: Path,
+    *,
+    vehicle: Vehicle | None = None,
+    options: ArduPilotOptions | None = None,
+    with_dvl: bool = True,
+) -> ArduPilotLogs:
+    """Return what a log holds; raises and takes what :func:`convert_ardupilot` does.
+
+    ``with_dvl`` is whether its movements are the DVL's: not where a recording of the DVL itself
+    lies beside it.
+    """
     options = options or ArduPilotOptions()
     messages, notes = _read(log)
-    for name, what in (("IMU", "inertial data"), ("VISO", "movements of a DVL")):
+    wanted = {"IMU": "inertial data", **({"VISO": "movements of a DVL"} if with_dvl else {})}
+    for name, what in wanted.items():
         if name not in messages:
             raise DataError(
                 f"{log}: no message {name}, {what}; it has {', '.join(sorted(messages)) or 'none'};"
-                " a DVL that sends VISION_POSITION_DELTA makes VISO, with VISO_TYPE = 1"
+                " a DVL that sends VISION_POSITION_DELTA makes VISO, with VISO_TYPE = 1; a DVL's "
+                "own recording can be given beside it"
             )
     parameters = _parameters(messages.get("PARM", {}))
     offset_s, said = _clock(log, messages)
     notes += said
     imu = _imu(messages["IMU"], offset_s, vehicle)
-    dvl = _dvl(log, messages["VISO"], offset_s, vehicle, parameters)
+    dvl = _dvl(log, messages["VISO"], offset_s, vehicle, parameters) if with_dvl else None
+    if not with_dvl and "VISO" in messages:
+        notes.append("VISO: movements left out, for the DVL's own recording lies beside it.")
     gnss, said = _gnss(messages, offset_s, vehicle)
     notes += said
     depth, said = _depth(messages, offset_s, vehicle, parameters, gnss, options)
@@ -120,14 +152,11 @@ def convert_ardupilot(
             "No --vehicle: the IMU is taken for a consumer MEMS unit (100 deg/h, 0.4 deg/sqrt(h), "
             f"5 mg), velocities for {BEAM_SIGMA} m/s, depths for {DEPTH_SIGMA} m."
         )
-    logs = [one for one in (imu, dvl, depth, gnss) if one is not None]
     labels = {"imu": "IMU", "dvl": "VISO", "depth": "BARO", "gnss": "GPS"}
-    return mission_from(
-        logs,
-        vehicle,
-        source=log,
-        labels={section: f"{log.name}: {name}" for section, name in labels.items()},
-        notes=notes,
+    return ArduPilotLogs(
+        tuple(one for one in (imu, dvl, depth, gnss) if one is not None),
+        {section: f"{log.name}: {name}" for section, name in labels.items()},
+        tuple(notes),
     )
 
 

@@ -1,4 +1,4 @@
-"""An IMU's table and recordings of other instruments, on one clock, as a mission folder."""
+"""Inertial data and recordings of other instruments, on one clock, as a mission folder."""
 
 from __future__ import annotations
 
@@ -17,6 +17,11 @@ import numpy as np
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frames import BodyAxes
 from ssm_graph.base.progress import told
+from ssm_graph.io.ardupilot.convert import (
+    ArduPilotOptions,
+    is_ardupilot,
+    logs_of_ardupilot,
+)
 from ssm_graph.io.columns.convert import logs_of_columns
 from ssm_graph.io.columns.map_file import ColumnMap
 from ssm_graph.io.columns.sources import ENDINGS
@@ -29,6 +34,7 @@ from ssm_graph.live.recorded.turns import clock_offset
 from ssm_graph.mission.mission import Mission, Reference
 from ssm_graph.mission.vehicle import Vehicle
 from ssm_graph.sensors.compass import HeadingReading
+from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.imu import IMU, ImuLog, ImuSample
 from ssm_graph.sensors.instrument import read_columns
 from ssm_graph.sensors.messages import Message
@@ -45,28 +51,35 @@ class Merged(NamedTuple):
 
 
 def merge_recordings(
-    logs: Sequence[Path], out: Path, *, vehicle: Vehicle, offset_s: float | None = None
+    logs: Sequence[Path],
+    out: Path,
+    *,
+    vehicle: Vehicle,
+    offset_s: float | None = None,
+    ardupilot: ArduPilotOptions | None = None,
 ) -> Merged:
-    """Write a mission folder of a table of inertial data and recordings of other instruments.
+    """Write a mission folder of one file of inertial data and recordings of other instruments.
 
     Each recording is moved onto the clock of the inertial data by ``offset_s``, s, or by the turns
     that its headings show, where it has any.
 
-    Raises :class:`ConfigError`: not one table of inertial data. Raises :class:`DataError`: a file
+    Raises :class:`ConfigError`: not one file of inertial data. Raises :class:`DataError`: a file
     cannot be read, or nothing tells how its clock stands to that of the inertial data.
 
     Parameters
     ----------
-    logs : one table with the columns of ``imu.csv``; the others as :func:`read_recorded` reads.
+    logs : one table with the columns of ``imu.csv`` or log of ArduPilot, whose depths and fixes
+        count, too; the others as :func:`read_recorded` reads.
     out : folder, made if it does not exist.
     vehicle : of which the mission is.
     offset_s : what is to be added to the times of the recordings, s; None to find it.
+    ardupilot : water and its surface, of a log of ArduPilot.
     """
-    own = [log for log in logs if _is_inertial(log)]
+    own = [log for log in logs if _is_inertial(log) or is_ardupilot(log)]
     if len(own) != 1:
         raise ConfigError(
-            f"expected one table with the columns of imu.csv among the files, got {len(own)}: "
-            f"{', '.join(map(str, logs))}"
+            "expected one table with the columns of imu.csv, or one log of ArduPilot, among the "
+            f"files, got {len(own)}: {', '.join(map(str, logs))}"
         )
     recordings: dict[Path, Recorded] = {}
     for log in logs:
@@ -74,10 +87,15 @@ def merge_recordings(
             continue
         found = read_recorded(log)
         if found is None:
-            raise DataError(f"{log}: neither a table of inertial data nor a recording that is read")
+            raise DataError(f"{log}: neither inertial data nor a recording that is read")
         recordings[log] = found
-    imu = _inertial(own[0], vehicle)
-    return _joined([imu], recordings, out, vehicle=vehicle, offset_s=offset_s)
+    if not is_ardupilot(own[0]):
+        imu = _inertial(own[0], vehicle)
+        return _joined([imu], recordings, out, vehicle=vehicle, offset_s=offset_s)
+    has_pings = any(isinstance(m, Ping) for one in recordings.values() for m in one.messages)
+    held = logs_of_ardupilot(own[0], vehicle=vehicle, options=ardupilot, with_dvl=not has_pings)
+    made = _joined(held.logs, recordings, out, vehicle=vehicle, offset_s=offset_s)
+    return Merged(made.mission, (*held.notes, *made.notes))
 
 
 def merge_columns(
@@ -144,10 +162,15 @@ def _joined(
     imu = next(log for log in logs if isinstance(log, ImuLog))
     notes: list[str] = []
     streams = [list(BY_LOG[type(log)].messages_of(log)) for log in logs]
-    known = {BY_LOG[kind].section for kind in vehicle.bare_logs}
+    has = {BY_LOG[type(log)].section for log in logs}
+    known = {BY_LOG[kind].section for kind in vehicle.bare_logs} - has
     for log, found in recordings.items():
         shift_s, said = _shift(log, found.messages, imu, offset_s)
         notes += [*(f"{log.name}: {note}" for note in found.told), said]
+        notes += [
+            f"{log.name}: [{name}] left out: the vehicle has one, of which the other log tells."
+            for name in sorted(has & {BY_MESSAGE[type(one)].section for one in found.messages})
+        ]
         streams += _on_clock(found.messages, shift_s, known)
     mission = _written(streams, out, vehicle)
     return Merged(mission, (*notes, *mission.notes))
@@ -161,7 +184,7 @@ def mission_of_recording(log: Path, found: Recorded, out: Path, *, vehicle: Vehi
     if not any(isinstance(message, ImuSample) for message in found.messages):
         raise ConfigError(
             f"{log}: --vehicle makes a mission of a recording with inertial data, and this has "
-            "none: give the table of an IMU beside it"
+            "none: give that of an IMU, a table or a log of ArduPilot, beside it"
         )
     known = {BY_LOG[kind].section for kind in vehicle.bare_logs}
     mission = _written(_on_clock(found.messages, 0.0, known), out, vehicle)
