@@ -27,6 +27,7 @@ from ssm_graph.sensors.features import FeatureLog, FeatureSighting
 from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.simulation import AidSettings, Grade, GrossErrors, SimulatedMission, SpiralRoute
 from ssm_graph.simulation.features import FeatureSettings
+from ssm_graph.smoothers.faults.hypotheses import of_aid
 from ssm_graph.smoothers.fixed_lag import FixedLagConfig, solve_fixed_lag
 from tests.aids_fixture import weights_of
 from tests.helpers import assert_consistent, assert_jacobians_match, rotation, simulated
@@ -153,6 +154,13 @@ def test_live_answers_leave_them_out_and_say_so() -> None:
     np.testing.assert_array_equal(joined(delayed, "time_s"), joined(keyframes, "time_s"))
     (event,) = (event for event in smoother.take_events() if event.kind == "not_used")
     assert "[features]" in event.text
+
+
+def test_what_is_no_place_is_not_said_in_metres() -> None:
+    """Of what a lie of a sonar is, the sigmas of its components are told; of fixes metres."""
+    for name, says in (("feature", False), ("GNSS", True)):
+        told = [one.say(np.ones(one.combined.shape[1])) for one in of_aid(name, 3)]
+        assert [" m " in text for text in told] == [says] * len(told)
 
 
 def test_a_folder_and_messages_keep_all_of_it(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import json
 import sys
 from dataclasses import replace
 from functools import cache
-from types import FrameType
+from types import FrameType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +18,7 @@ from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator import FixedLagSmoother, start
 from ssm_graph.live.estimator.intake import Intake
 from ssm_graph.live.estimator.start import MOST_MS, Beginning, Starter
+from ssm_graph.mission.estimate import Status
 from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.navigation import Health, Navigation
 from ssm_graph.mission.problem import ProblemConfig, build_problem
@@ -195,6 +196,26 @@ def test_a_sensor_that_contradicts_the_rest_is_begun_without() -> None:
     said = [event.text for event in smoother.take_events() if event.kind == "aligned"]
     assert len(said) == 1
     assert "without depth, which contradicts the rest" in said[0]
+
+
+def test_without_a_sensor_the_heading_has_to_be_known_as_well(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """An answer that is right and knows no heading is none to begin with."""
+    sigmas = iter([0.01, 1.0])
+
+    def smoothed(*_: object, **__: object) -> Steps[object]:
+        yield 0.0
+        sigma = next(sigmas)
+        status = Status.SUSPECT if sigma < 0.1 else Status.CONVERGED
+        found = SimpleNamespace(attitude_sigma=np.full((1, 3), sigma))
+        return SimpleNamespace(status=status, trajectory=found, reason="depth", notes=())
+
+    monkeypatch.setattr(start, "smooth_steps", smoothed)
+    monkeypatch.setattr(start, "replace", lambda made, **_: made)
+    starter = Starter(given(moving())[0], ProblemConfig(), EventLog())
+    assert finished(starter._align_steps(moving().mission)) is None
+    assert "move while GNSS is there" in starter.reason
 
 
 def calls(function: object, *args: object) -> int:

@@ -170,16 +170,18 @@ class Starter:
         """Smooth what there is; begin at its end if that may be believed."""
         yield 1e-3 * len(mission.imu.time_s)  # for the mission itself
         estimate = yield from self._smooth_steps(mission)
-        sigma = float(estimate.trajectory.attitude_sigma[-1, 2])
-        is_surely_wrong = not estimate.status.is_good and not sigma > SAFE_HEADING_SIGMA
+        is_surely_wrong = (
+            not estimate.status.is_good and _heading_sigma(estimate) <= SAFE_HEADING_SIGMA
+        )
         for name, rest in _with_one_less(mission) if is_surely_wrong else ():
             with contextlib.suppress(SsmGraphError, np.linalg.LinAlgError):
                 other = yield from self._smooth_steps(rest)
-                if other.status.is_good:
+                if _may_begin(other):
                     note = f"without {name}, which contradicts the rest"
                     mission, estimate = rest, replace(other, notes=(*other.notes, note))
                     break
-        if not estimate.status.is_good or sigma > SAFE_HEADING_SIGMA:
+        if not _may_begin(estimate):
+            sigma = _heading_sigma(estimate)
             text = f"heading sigma {np.degrees(sigma):.0f} deg: {estimate.reason}; move while GNSS"
             self._wait(f"{text} is there")
             return None
@@ -213,6 +215,16 @@ class Starter:
     def _wait(self, reason: str) -> None:
         self.reason = reason
         self._events.tell(self._now_s, Severity.INFO, "aligning", reason)
+
+
+def _heading_sigma(estimate: Estimate) -> float:
+    """Return that of its end, rad."""
+    return float(estimate.trajectory.attitude_sigma[-1, 2])
+
+
+def _may_begin(estimate: Estimate) -> bool:
+    """Return whether an estimate may be believed, and its heading is known, to begin at its end."""
+    return estimate.status.is_good and _heading_sigma(estimate) <= SAFE_HEADING_SIGMA
 
 
 def _with_one_less(mission: Mission) -> Iterator[tuple[str, Mission]]:

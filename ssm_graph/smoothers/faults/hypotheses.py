@@ -175,7 +175,12 @@ def _of_inertial() -> Iterator[Hypothesis]:
 def of_aid(name: str, dim: int) -> Iterator[Hypothesis]:
     """Return the hypotheses of an aid of so many components, by its name."""
     unit, size = AIDS.get(name, ("", 1e3))
-    say = _place if dim == 3 else lambda s: f"{s[0]:+.3g} {unit}".rstrip()
+    is_place = dim == 3 and unit == "m"
+
+    def numbers(s: Array) -> str:
+        return f"{', '.join(f'{one:+.3g}' for one in s)} {unit}".rstrip()
+
+    say = _place if is_place else numbers
     one = Hypothesis(name, name, np.eye(dim), np.full(dim, size), say)
     for course in Course:
         is_usual = name == "depth" and course is Course.RAMP
@@ -186,7 +191,8 @@ def of_aid(name: str, dim: int) -> Iterator[Hypothesis]:
     # numbers, a place of three pays for what it does not need.
     for part, words in ((slice(0, 2), _level), (slice(2, 3), _up)):
         own = np.eye(dim)[:, part]
-        small = replace(one, combined=own, sigma=np.full(own.shape[1], size), say=words)
+        sigma = np.full(own.shape[1], size)
+        small = replace(one, combined=own, sigma=sigma, say=words if is_place else numbers)
         for course in (Course.CONSTANT, Course.RAMP):
             yield replace(small, course=course)
 
