@@ -121,6 +121,22 @@ def test_tables_of_any_columns_join_a_recording(
     assert np.abs(found.dvl.time_s - sim().mission.dvl.time_s).max() < 0.02
 
 
+def test_of_two_instruments_of_a_kind_one_counts(folder: Path, tmp_path: Path) -> None:
+    """That of the file named first; of one log in two files nothing is lost but what is in both."""
+    vehicle, mission = read_vehicle(folder / "mission"), sim().mission
+    lines = (folder / "dvl.json").read_text().splitlines(keepends=True)
+    half = len(lines) // 2
+    parts = {"first": lines[: half + 20], "second": lines[half:], "other": lines}
+    for name, some in parts.items():
+        (tmp_path / f"{name}.json").write_text("".join(some))
+    files = [folder / "mission" / "imu.csv", *(tmp_path / f"{name}.json" for name in parts)]
+    found = merge_recordings(files, tmp_path / "all", vehicle=vehicle, offset_s=-AHEAD_S)
+    np.testing.assert_allclose(found.mission.dvl.time_s, mission.dvl.time_s, atol=1e-5)
+    said = [note for note in found.notes if "of [dvl] left out" in note]
+    assert [note.partition(":")[0] for note in said] == ["second.json", "other.json"]
+    assert f"{len(mission.dvl.time_s)} of {len(mission.dvl.time_s)} rows" in said[1]
+
+
 def test_offset_and_its_sigma() -> None:
     """Over many noises: right on the mean, and as uncertain as is said, to a factor of three."""
     imu, time_s = sim().mission.imu, np.arange(1.0, 79.0, 0.2)

@@ -171,9 +171,25 @@ def _joined(
             f"{log.name}: [{name}] left out: the vehicle has one, of which the other log tells."
             for name in sorted(has & {BY_MESSAGE[type(one)].section for one in found.messages})
         ]
-        streams += _on_clock(found.messages, shift_s, known)
+        for stream in _on_clock(found.messages, shift_s, known):
+            kept = _beside(stream, streams[len(logs) :])
+            streams.append(kept)
+            if len(kept) < len(stream):
+                notes.append(
+                    f"{log.name}: {len(stream) - len(kept)} of {len(stream)} rows of "
+                    f"[{BY_MESSAGE[type(stream[0])].section}] left out: the vehicle has one, of "
+                    "which a recording given before tells at that time."
+                )
     mission = _written(streams, out, vehicle)
     return Merged(mission, (*notes, *mission.notes))
+
+
+def _beside(stream: list[Message], others: Sequence[list[Message]]) -> list[Message]:
+    """Return messages of one instrument without those amid others of its kind."""
+    kind = type(stream[0])
+    alike = (one for one in others if one and isinstance(one[0], kind))
+    spans = [(one[0].time_s, one[-1].time_s) for one in alike]
+    return [m for m in stream if not any(begin <= m.time_s <= end for begin, end in spans)]
 
 
 def mission_of_recording(log: Path, found: Recorded, out: Path, *, vehicle: Vehicle) -> Merged:
