@@ -126,6 +126,12 @@ class _Features(Instrument):
             )
         return notes
 
+    def problem(self, message: Message, bare: FeatureLog) -> str | None:
+        assert isinstance(message, FeatureSighting)
+        if message.feature % 1.0 != 0.0:
+            return f"feature {message.feature:g}: expected a whole number"
+        return super().problem(message, bare)
+
 
 FEWEST_TO_TELL: Final = 20
 """Sightings of which one at least is expected to be off the axis by more than 1.6 degrees."""

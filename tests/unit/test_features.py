@@ -152,6 +152,8 @@ def test_live_answers_leave_them_out_and_say_so() -> None:
     )
     assert newest.since_aid_s == expected.since_aid_s > 7.0
     np.testing.assert_array_equal(joined(delayed, "time_s"), joined(keyframes, "time_s"))
+    smoother.push(FeatureSighting(11.0, 2.5, 12.0, 0.0, 0.0))
+    assert smoother.counts == {"features implausible": 1}
     (event,) = (event for event in smoother.take_events() if event.kind == "not_used")
     assert "[features]" in event.text
 
