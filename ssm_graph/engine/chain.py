@@ -81,7 +81,7 @@ class ChainSolution(NamedTuple):
         own, border = rows[:, :n], rows[:, n:]
         through = np.einsum("mi,mij->mj", own, self.sensitivity[keyframe]) + border
         inner = np.einsum("mi,mij,mj->m", own, self.conditional[keyframe], own, optimize=True)
-        return np.asarray(inner + np.einsum("mi,ij,mj->m", through, self.constants_cov, through))
+        return np.asarray(inner + ((through @ self.constants_cov) * through).sum(axis=1))
 
 
 @cache
