@@ -131,6 +131,33 @@ def test_leftovers_become_landmarks() -> None:
     assert errors.n_left_out < 0.02 * errors.n
 
 
+def test_a_filter_goes_through_unnamed_landmarks_that_stand_together() -> None:
+    """Two that are seen in one scan where one is begun: each landmark once in a scan."""
+    rng = np.random.default_rng(0)
+    log = drive(RING, seen_s=((0.0, 10.0),))
+    seen_s = np.repeat(np.unique(log.seen_s), 25)
+    n = len(seen_s)
+    seen = np.column_stack([rng.uniform(1.0, 20.0, n), rng.uniform(-1.5, 1.5, n)])
+    log = replace(log, seen_s=seen_s, seen=seen, landmark=np.full(n, UNKNOWN))
+    problem = problem_of_log(log)
+    found = associate(problem, log.noise).landmark
+    scans = np.column_stack([problem.keyframe, found])[found != UNKNOWN]
+    assert len(scans) > 20
+    assert len(np.unique(scans, axis=0)) == len(scans)
+    solved = solve(problem, log.noise, Asked(method="ekf", association=Association.JOINT))
+    assert np.isfinite(solved.answer.landmarks).all()
+
+
+def test_a_filter_without_any_landmark_answers() -> None:
+    """One sighting makes none: the path is the odometry's."""
+    log = drive(RING, seen_s=((0.0, 20.0),))
+    log = replace(log, seen_s=log.seen_s[:1], seen=log.seen[:1], landmark=np.full(1, UNKNOWN))
+    asked = Asked(method="ekf-weighted", association=Association.JOINT)
+    estimate = solve(problem_of_log(log), log.noise, asked).answer
+    assert len(estimate.landmarks) == 0
+    assert np.isfinite(estimate.pose).all()
+
+
 def test_many_leftovers_take_little_memory() -> None:
     """They are compared with what is near, not each with all others."""
     rng = np.random.default_rng(0)
