@@ -145,8 +145,10 @@ def ratio_text(ours: ArrayLike, other: ArrayLike) -> str:
 
 
 def number_text(x: float) -> str:
-    """Return three digits, or a dash."""
-    return f"{x:.3g}" if np.isfinite(x) else "–"
+    """Return three digits, all before the point of thousands, or a dash."""
+    if not np.isfinite(x):
+        return "–"
+    return f"{x:.0f}" if 999.5 <= abs(x) < 1e6 else f"{x:.3g}"
 
 
 def rms(errors: ArrayLike) -> float:

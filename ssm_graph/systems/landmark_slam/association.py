@@ -249,7 +249,8 @@ def _sighted(
         one = _Provisional(place, (*one.rows, row), k)
         if len(one.rows) >= how.sightings and len(slam.ids) + len(joined) < MOST_LANDMARKS:
             name = len(slam.ids) + len(joined)
-            found[list(one.rows)] = name
+            once = {int(problem.keyframe[i]): i for i in one.rows}  # a landmark is once in a scan
+            found[list(once.values())] = name
             joined.append((row, name))
         else:
             waiting.append(one)

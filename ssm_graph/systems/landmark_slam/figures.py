@@ -146,7 +146,10 @@ def draw_map(
     draw_panel(axes, Panel(x="x, m", y="y, m", curves=curves, legend=where))
     axes.set_aspect("equal", adjustable="datalim")
     for label, place in zip(labels, landmarks, strict=False):
-        axes.annotate(label, (float(place[0]), float(place[1])), fontsize=5.0, color=INK)
+        axes.annotate(
+            label, (float(place[0]), float(place[1])), xytext=(4.0, 3.0),
+            textcoords="offset points", fontsize=5.0, color=INK,
+        )  # fmt: skip
 
 
 def ellipse(place: Array, cov: Array) -> Ellipse:

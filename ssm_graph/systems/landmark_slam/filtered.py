@@ -85,7 +85,7 @@ def filtered(problem: SlamProblem, noise: SlamNoise, method: str) -> SlamEstimat
             weights[np.array(rows)[told.known]] = told.weights[0]
         pose[k], cov[k] = slam.pose[0], slam.pose_cov[0]
     places, covs = np.full((L, 2), np.nan), np.full((L, 2, 2), np.nan)
-    for name in np.unique(problem.landmark[np.array(is_whole)]).tolist():
+    for name in np.unique(problem.landmark[np.array(is_whole, dtype=bool)]).tolist():
         place, place_cov = slam.landmark(name)
         places[name], covs[name] = place[0], place_cov[0]
     end = SlamNoise(*(_sigmas(x[0]) for x in (slam.noise.control, slam.noise.observation)))

@@ -23,6 +23,9 @@ SAME_TIME_S: Final = 0.01
 LONGEST_STEP_S: Final = 1.0
 """From a pose to the next. Within a step errors of turn and of distance are taken for independent:
 at 0.04 rad/sqrt(s) that leaves out 0.02 of the way, less than such odometry is worth."""
+LONGEST_GAP_S: Final = 86_400.0
+"""Without any observation. After a day at 0.04 rad/sqrt(s) nothing is left of a heading (12 rad); a
+clock that was set while the log was written jumps by more, and each second of it is a pose."""
 TRUTH_GAP_S: Final = 0.2
 """Nearer than this to samples on both sides the truth is interpolated."""
 STANDSTILL: Final = 0.05
@@ -166,7 +169,14 @@ def problem_of_log(log: LandmarkLog, *, start: Array | None = None) -> SlamProbl
 
 def _filled(time_s: Array) -> tuple[Array, NDArray[np.intp]]:
     """Return times with as many between as the longest step asks for, and where they went."""
-    parts = np.maximum(np.ceil(np.diff(time_s) / LONGEST_STEP_S), 1.0).astype(np.intp)
+    gaps = np.diff(time_s)
+    if gaps.max(initial=0.0) > LONGEST_GAP_S:
+        row = int(np.argmax(gaps))
+        raise DataError(
+            f"observations: none from {time_s[row]:.3f} to {time_s[row + 1]:.3f} s; expected one "
+            f"in {LONGEST_GAP_S:.0f} s; was a clock set, or are times not in seconds? cut the log"
+        )
+    parts = np.maximum(np.ceil(gaps / LONGEST_STEP_S), 1.0).astype(np.intp)
     at = np.append(0, np.cumsum(parts))
     return np.interp(np.arange(at[-1] + 1), at, time_s), at
 

@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
 
 from ssm_graph.base import chi2
 from ssm_graph.base.frozen import Array
@@ -55,15 +56,15 @@ def reassociate(problem: SlamProblem, sigma: Array, pose: Array, places: Array) 
     cost = seen.squares(places)
     found = np.full(len(problem.keyframe), UNKNOWN, dtype=np.intp)
     seen.pair(np.unique(problem.keyframe[seen.rows]), cost, found)
+    of, to = seen.heaps(seen.rows[found[seen.rows] == UNKNOWN])
     for _ in range(MOST_NEW):
-        left = seen.rows[found[seen.rows] == UNKNOWN]
-        if len(left) < FEWEST:
+        is_left = found == UNKNOWN
+        both = is_left[of] & is_left[to]
+        of, to = of[both], to[both]
+        size = np.bincount(to, minlength=len(found))
+        if size.max(initial=0) < FEWEST:
             break
-        near = seen.between(left) < IN_A_HEAP
-        size = near.sum(axis=0)
-        if size.max() < FEWEST:
-            break
-        place = seen.place[left][near[:, int(np.argmax(size))]].mean(axis=0)
+        place = seen.place[of[to == np.argmax(size)]].mean(axis=0)
         places = np.vstack([places, place])
         cost = np.column_stack([cost, seen.squares(place[None])])
         touched = problem.keyframe[seen.rows[cost[seen.rows, -1] < FITS]]
@@ -97,10 +98,20 @@ class _Seen:
         off = self.place[:, None] - places
         return np.asarray(np.square(np.einsum("mij,mlj->mli", self._axes, off)).sum(axis=2))
 
-    def between(self, rows: NDArray[np.intp]) -> Array:
-        """Return how far (n, n) some observations are from others, by the sigmas of the first."""
-        off = self.place[rows][:, None] - self.place[rows]
-        return np.asarray(np.square(np.einsum("mij,mlj->mli", self._axes[rows], off)).sum(axis=2))
+    def heaps(self, rows: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return the pairs (P,), (P,) of some observations where the second is near the first.
+
+        Near by the sigmas of the first; only those that a tree finds near in metres are compared.
+        """
+        if not len(rows):
+            return rows, rows
+        reach_m = np.sqrt(IN_A_HEAP) / np.linalg.norm(self._axes[rows], axis=2).min(axis=1)
+        near = cKDTree(self.place[rows]).query_ball_point(self.place[rows], reach_m)
+        of = np.repeat(rows, [len(one) for one in near])
+        to = rows[np.concatenate(near).astype(np.intp)]
+        off = np.einsum("pij,pj->pi", self._axes[of], self.place[of] - self.place[to])
+        is_near = np.square(off).sum(axis=1) < IN_A_HEAP
+        return of[is_near], to[is_near]
 
     def pair(self, keyframes: NDArray[np.intp], cost: Array, found: NDArray[np.intp]) -> None:
         """Write the landmarks of some scans: as many pairs that fit as there are, and nearest."""

@@ -29,6 +29,8 @@ from ssm_graph.systems.road_map.refinement import sigmas_of
 from ssm_graph.systems.road_map.window import in_plane
 
 _MARGIN_M: Final = 25.0
+_LEAST_SHOWN_M: Final = 1e-3
+"""An error that changes its sign would stretch a logarithmic axis without end; maps hold 1 mm."""
 _COLOURS: Final = ("#9DB7CC", "#56B4E9", "#0072B2", "#004466")
 
 
@@ -62,6 +64,8 @@ def _particles(axes: Axes, drive: Drive, road_map: RoadMap, found: Located) -> N
     if drive.truth is not None:
         places.append(drive.truth.x_y)
     low, high = box_around(places, _MARGIN_M)
+    middle, half_m = 0.5 * (low + high), 0.5 * float((high - low).max())
+    low, high = middle - half_m, middle + half_m  # room for the legend beside a straight way
     _draw_map(axes, road_map, low, high)
     draw_snapshots(axes, found.snapshots, _COLOURS, digits=1)
     axes.plot(*drive.gnss.x_y.T, "x", color=REDUCED, markersize=4.0, label="GNSS")
@@ -123,9 +127,10 @@ def _errors(axes: Axes, drive: Drive, found: Located) -> None:
             error = _error(drive.truth, found)[:, column]
             axes.plot(track.driven_m, np.abs(error), color=colour, label=f"error {name}")
     if np.isfinite(found.first_fix_m):
-        axes.axvline(found.first_fix_m, color=GREY, linewidth=0.8)
+        axes.axvline(found.first_fix_m, color=GREY, linewidth=0.8, label="lane first known")
     axes.set_yscale("log")
-    dress(axes, title="Error and sigma of the particles", x="driven (m)", y="m")
+    axes.set_ylim(bottom=_LEAST_SHOWN_M)
+    dress(axes, title="Error and sigma of the particles", x="driven (m)", y="error, 2 sigma (m)")
     legend(axes, loc="best")
 
 

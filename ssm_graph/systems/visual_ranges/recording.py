@@ -97,7 +97,7 @@ def _anchors(rr: Any, stream: Any, ranging: RangingResult) -> None:
         square, axes = np.linalg.eigh(one.covariance)
         axes[:, 2] *= np.sign(np.linalg.det(axes))
         half = SIGMAS * np.sqrt(np.maximum(square, 0.0))
-        name = f"map/anchors/{one.name}"
+        name = rr.new_entity_path(["map", "anchors", one.name])
         shape = rr.Ellipsoids3D(half_sizes=[half], colors=[ANCHOR_COLOUR])
         turned = rr.Transform3D(translation=one.place_m, mat3x3=axes)
         label = f"{one.name}, {one.state.name.lower()}"
@@ -109,23 +109,24 @@ def _anchors(rr: Any, stream: Any, ranging: RangingResult) -> None:
         )  # fmt: skip
         if len(one.alternatives_m):
             others = rr.Points3D(one.alternatives_m, labels=[f"{one.name}, or here"])
-            stream.log(f"map/anchors/{one.name} else", others, static=True)
+            stream.log(["map", "anchors", f"{one.name} else"], others, static=True)
 
 
 def _over_time(rr: Any, stream: Any, sequence: Sequence, ranging: RangingResult) -> None:
     begin_s = float(sequence.time_s[0])
 
-    def curve(name: str, time_s: Array, values: Array) -> None:
+    def curve(parts: list[str], time_s: Array, values: Array) -> None:
         known = np.isfinite(values)
         if known.any():
             time = rr.TimeColumn(TIMELINE, duration=time_s[known] - begin_s)
+            name = rr.new_entity_path(parts)  # anchors may be called anything
             stream.send_columns(name, [time], rr.Scalars.columns(scalars=values[known]))
 
     for j, one in enumerate(ranging.anchors):
         own = ranging.anchor_of == j
         time_s = sequence.ranges.time_s[own]
-        curve(f"ranges/error_m/{one.name}", time_s, ranging.error_m[own])
-        curve(f"ranges/weight/{one.name}", time_s, ranging.weight[own])
+        curve(["ranges", "error_m", one.name], time_s, ranging.error_m[own])
+        curve(["ranges", "weight", one.name], time_s, ranging.weight[own])
     history = ranging.scale_history
-    curve("scale/m_per_map_unit", history[:, 0], history[:, 1])
-    curve("scale/relative_sigma", history[:, 0], history[:, 2])
+    curve(["scale", "m_per_map_unit"], history[:, 0], history[:, 1])
+    curve(["scale", "relative_sigma"], history[:, 0], history[:, 2])

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array, FrozenArrays, ShortRepr, shaped
 from ssm_graph.systems.visual_ranges.vehicle import Vehicle
 
@@ -56,6 +57,18 @@ class Sequence(ShortRepr):
     """Depth and dead reckoning of what carries the camera."""
     lever_arm_sigma_m: float = 0.0
     """Standard deviation of each number of the lever arm; above 0 it is found with the rest."""
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.lever_arm_m).all():
+            raise ConfigError(
+                f"lever_arm_m: expected three finite numbers, got {self.lever_arm_m}; "
+                "where it was not measured, state 0 0 0 and lever_arm_sigma_m"
+            )
+        if not 0.0 <= self.lever_arm_sigma_m < np.inf:
+            raise ConfigError(
+                "lever_arm_sigma_m: expected 0 (exact) or more, got "
+                f"{self.lever_arm_sigma_m:g}; try 0.05"
+            )
 
     def __len__(self) -> int:
         return len(self.time_s)

@@ -19,7 +19,11 @@ from ssm_graph.systems.visual_ranges.camera import Camera
 from ssm_graph.systems.visual_ranges.ranges import at_the_anchor
 from ssm_graph.systems.visual_ranges.render import Image, Water, render
 from ssm_graph.systems.visual_ranges.sequence import PathTruth, Sequence
-from ssm_graph.systems.visual_ranges.simulated_ranges import RangeFaults, simulated_ranges
+from ssm_graph.systems.visual_ranges.simulated_ranges import (
+    RangeFaults,
+    check_span,
+    simulated_ranges,
+)
 from ssm_graph.systems.visual_ranges.simulated_vehicle import VehicleFaults, simulated_vehicle
 from ssm_graph.systems.visual_ranges.vehicle import Vehicle
 from ssm_graph.systems.visual_ranges.world import RING_M, Picture, World, bottom, corridor, room
@@ -49,6 +53,9 @@ class ImageFaults:
     covered_s: tuple[float, float] = (0.0, 0.0)
     """The lens is black from, to."""
     dropped_share: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_span("covered_s", self.covered_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +90,7 @@ class Run:
                 f"camera model {self.camera.model!r}: the renderer's lens is without distortion; "
                 "try pinhole"
             )
-        if not (self.duration_s > 0.0 and self.rate_hz > 0.0 and self.ranges.rate_hz > 0.0):
+        if not all(0.0 < x < np.inf for x in (self.duration_s, self.rate_hz, self.ranges.rate_hz)):
             raise ConfigError("duration and rates: expected numbers above zero; try 60 s at 20 Hz")
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
-from ssm_graph.base.errors import DataError
+from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.systems.visual_ranges.ranges import Ranges, screened_ranges
 from ssm_graph.systems.visual_ranges.sequence import Sequence
@@ -54,6 +54,25 @@ class RangeFaults:
     """True one, of an acoustic range: two-way, stamped when the reply comes; 0 for radio."""
     assumed_sound_speed_m_per_s: float = ASSUMED_SOUND_SPEED
     """By which times become ranges."""
+
+    def __post_init__(self) -> None:
+        for name in ("nlos_share", "lost_share"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ConfigError(f"{name}: expected 0 to 1, got {getattr(self, name):g}; try 0.3")
+        if not 0.0 < self.sigma_m < np.inf:
+            raise ConfigError(f"sigma_m: expected above 0, got {self.sigma_m:g}; try 0.08")
+        if not np.isfinite([self.bias_m, self.bias_walk_m, self.clock_s]).all():
+            raise ConfigError(
+                "biases and clock of ranges: expected finite numbers, got "
+                f"{self.bias_m:g} m, {self.bias_walk_m:g} m and {self.clock_s:g} s"
+            )
+        check_span("silent_s", self.silent_s)
+
+
+def check_span(name: str, span_s: tuple[float, float]) -> None:
+    """Raise where a time from ... to is not one."""
+    if not (np.isfinite(span_s).all() and span_s[0] <= span_s[1]):
+        raise ConfigError(f"{name}: expected from and to, s, got {span_s[0]:g} {span_s[1]:g}")
 
 
 def simulated_ranges(

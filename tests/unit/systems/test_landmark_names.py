@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.systems.landmark_slam.association import (
     Association,
@@ -74,9 +76,18 @@ def test_poses_stand_in_gaps() -> None:
     assert problem_of_log(still).control[:, 3].max() < 0.06
 
 
+def test_a_clock_that_was_set_is_told() -> None:
+    """Each second of the jump would be a pose."""
+    log = drive(RING, seen_s=((0.0, 10.0), (60.3, 70.0)))
+    odometry_s, seen_s = (t + 2e5 * (t > 30.0) for t in (log.odometry_s, log.seen_s))
+    jumped = replace(log, odometry_s=odometry_s, seen_s=seen_s)
+    with pytest.raises(DataError, match=r"none from 9\.500 to 200060\.500 s; .*clock"):
+        problem_of_log(jumped)
+
+
 def test_what_odometry_is_wrong_by_becomes_known() -> None:
     """A turn rate that is 0.03 rad/s too large, and the path with it as good as without."""
-    names_known = []
+    errors_m = []
     for wrong in (0.0, 0.03):
         log = drive(RING, seen_s=((0.0, 40.0), (70.0, 120.0)), wrong=wrong)
         answer = filtered(problem_of_log(log), log.noise, "ekf-weighted")
@@ -84,8 +95,8 @@ def test_what_odometry_is_wrong_by_becomes_known() -> None:
         assert turn == pytest.approx(-wrong, abs=0.004)
         problem = problem_of_log(log)
         true = np.column_stack([np.interp(problem.time_s, log.truth_s, x) for x in log.truth.T])
-        names_known.append(np.sqrt(np.mean(np.sum((answer.pose - true)[:, :2] ** 2, axis=1))))
-    assert names_known[1] < 3.0 * names_known[0] + 0.1
+        errors_m.append(np.sqrt(np.mean(np.sum((answer.pose - true)[:, :2] ** 2, axis=1))))
+    assert errors_m[1] < 3.0 * errors_m[0] + 0.1
 
 
 def test_after_a_blind_stretch_no_landmark_is_believed_at_once() -> None:
@@ -118,6 +129,51 @@ def test_leftovers_become_landmarks() -> None:
     assert errors.n_split == 0
     assert errors.n_wrong < 0.02 * errors.n
     assert errors.n_left_out < 0.02 * errors.n
+
+
+def test_a_filter_goes_through_unnamed_landmarks_that_stand_together() -> None:
+    """Two that are seen in one scan where one is begun: each landmark once in a scan."""
+    rng = np.random.default_rng(0)
+    log = drive(RING, seen_s=((0.0, 10.0),))
+    seen_s = np.repeat(np.unique(log.seen_s), 25)
+    n = len(seen_s)
+    seen = np.column_stack([rng.uniform(1.0, 20.0, n), rng.uniform(-1.5, 1.5, n)])
+    log = replace(log, seen_s=seen_s, seen=seen, landmark=np.full(n, UNKNOWN))
+    problem = problem_of_log(log)
+    found = associate(problem, log.noise).landmark
+    scans = np.column_stack([problem.keyframe, found])[found != UNKNOWN]
+    assert len(scans) > 20
+    assert len(np.unique(scans, axis=0)) == len(scans)
+    solved = solve(problem, log.noise, Asked(method="ekf", association=Association.JOINT))
+    assert np.isfinite(solved.answer.landmarks).all()
+
+
+def test_a_filter_without_any_landmark_answers() -> None:
+    """One sighting makes none: the path is the odometry's."""
+    log = drive(RING, seen_s=((0.0, 20.0),))
+    log = replace(log, seen_s=log.seen_s[:1], seen=log.seen[:1], landmark=np.full(1, UNKNOWN))
+    asked = Asked(method="ekf-weighted", association=Association.JOINT)
+    estimate = solve(problem_of_log(log), log.noise, asked).answer
+    assert len(estimate.landmarks) == 0
+    assert np.isfinite(estimate.pose).all()
+
+
+def test_many_leftovers_take_little_memory() -> None:
+    """They are compared with what is near, not each with all others."""
+    rng = np.random.default_rng(0)
+    log = drive(RING, seen_s=((0.0, 120.0),))
+    n = 3000
+    seen = np.column_stack([rng.uniform(20.0, 500.0, n), rng.uniform(-3.0, 3.0, n)])
+    seen_s = np.sort(rng.choice(log.odometry_s[:-1], n))
+    log = replace(log, seen_s=seen_s, seen=seen, landmark=np.full(n, UNKNOWN))
+    problem = problem_of_log(log)
+    pose = np.zeros((len(problem.time_s), 3))
+    tracemalloc.start()
+    found = reassociate(problem, SIGMA * problem.scales, pose, np.array([[1.0, 1.0]]))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert np.all(found.landmark == UNKNOWN)
+    assert peak < 20 * 2**20
 
 
 def test_unnamed_is_nearly_as_good_as_named() -> None:

@@ -158,15 +158,19 @@ def test_a_recording_for_rerun(tmp_path: Path) -> None:
     """What the viewer is given: every pose, the key frames' images, anchors, ranges, events."""
     reader = pytest.importorskip("rerun.chunk").RrdReader
     sequence, result = made()
-    write_recording(tmp_path / "recording.rrd", sequence, result)
+    assert result.ranging is not None
+    (one,) = result.ranging.anchors
+    ranging = replace(result.ranging, anchors=(replace(one, name="A/1 from 3.0 s"),))
+    write_recording(tmp_path / "recording.rrd", sequence, replace(result, ranging=ranging))
     chunks: dict[str, int] = {}
     for chunk in reader(tmp_path / "recording.rrd").stream().to_chunks():
         name = str(chunk.entity_path)
         chunks[name] = chunks.get(name, 0) + chunk.num_rows
     assert chunks["/map/camera"] == N + 1
     assert chunks["/map/camera/image"] == len(result.map.image)
-    assert chunks["/ranges/weight/A"] == N
-    assert {"/map/points", "/map/path", "/map/anchors/A", "/events"} <= set(chunks)
+    anchor = r"A\/1\ from\ 3.0\ s"  # one name, not a path
+    assert chunks[f"/ranges/weight/{anchor}"] == N
+    assert {"/map/points", "/map/path", f"/map/anchors/{anchor}", "/events"} <= set(chunks)
 
 
 def test_an_answer_by_the_vehicle_alone(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -156,3 +157,34 @@ def test_bad_readings_are_dropped_and_told() -> None:
         Ranges(
             np.array([1.0]), np.array([0]), np.array([-1.0]), np.ones(1), ("a",), np.ones((1, 3))
         )
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"nlos_share": 2.0},
+        {"nlos_share": np.nan},
+        {"lost_share": -0.1},
+        {"sigma_m": -1.0},
+        {"clock_s": np.inf},
+        {"silent_s": (5.0, 1.0)},
+    ],
+)
+def test_faults_of_ranges_that_cannot_be_are_refused(wrong: dict[str, Any]) -> None:
+    """Before anything is written with them."""
+    with pytest.raises(ConfigError, match="expected"):
+        RangeFaults(**wrong)
+
+
+def test_other_options_that_cannot_be_are_refused() -> None:
+    """A lens covered backwards, a run without end, a lever arm that is no place."""
+    with pytest.raises(ConfigError, match="covered_s: expected from and to"):
+        ImageFaults(covered_s=(5.0, 1.0))
+    with pytest.raises(ConfigError, match="expected numbers above zero"):
+        Run("room", duration_s=np.inf)
+    sequence = simulate(Run("room", 0, 1.0, texel_m=0.05)).sequence
+    for sigma_m in (-1.0, np.nan):
+        with pytest.raises(ConfigError, match="lever_arm_sigma_m: expected 0"):
+            replace(sequence, lever_arm_sigma_m=sigma_m)
+    with pytest.raises(ConfigError, match="lever_arm_m: expected three finite numbers"):
+        replace(sequence, lever_arm_m=(np.nan, 0.0, 0.0))

@@ -243,8 +243,9 @@ def chosen_images(n_images: int, options: ReadOptions) -> np.ndarray[tuple[int],
     last = n_images if options.count is None else options.first + options.count
     chosen = np.arange(n_images)[options.first : last]
     if len(chosen) < 2:
+        count = "" if options.count is None else f" --count {options.count}"
         raise DataError(
-            f"--first {options.first}: expected at least 2 images from there, the recording has "
+            f"--first {options.first}{count}: expected at least 2 images, the recording has "
             f"{n_images}"
         )
     return chosen
