@@ -14,7 +14,7 @@ from ssm_graph.simulation import DvlSettings, Fault, FaultShape, Grade, with_fau
 from ssm_graph.simulation.faults import Sensor
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
 from ssm_graph.smoothers.faults.search import FaultSearch
-from ssm_graph.smoothers.faults.windows import noisier_than_stated
+from ssm_graph.smoothers.faults.windows import Readings, disagreeing, noisier_than_stated
 from tests.helpers import simulated
 
 KEYFRAME_S = np.arange(601.0)
@@ -90,3 +90,18 @@ def test_a_loose_answer_is_no_noise() -> None:
     )
     of_imu = [one.treatment for one in found.faults if one.sensor == "IMU"]
     assert of_imu == [Treatment.WIDENED]
+
+
+@pytest.mark.parametrize("n_off", [2, 4])
+def test_beams_that_all_disagree_have_the_inertial_data_for_a_rival(n_off: int) -> None:
+    """All are compared with them; of some beams alone each is named."""
+    rng, time_s = np.random.default_rng(2), np.arange(300.0)
+    slow = 2.0 * np.sin(2.0 * np.pi * time_s / 40.0)
+    readings = [
+        Readings(f"DVL beam {k + 1}", time_s, rng.standard_normal(300) + slow * (k < n_off), 0.04)
+        for k in range(4)
+    ]
+    found = disagreeing(readings, time_s)
+    names = ["DVL"] if n_off == 4 else ["DVL beam 1", "DVL beam 2"]
+    assert [one.sensor for one in found] == names
+    assert ("IMU" in found[0].rivals) == (n_off == 4)

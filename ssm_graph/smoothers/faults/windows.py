@@ -8,7 +8,8 @@ Their means and trends tell nothing, for the answer follows these.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -23,7 +24,7 @@ from ssm_graph.graph.aids.depth import DepthMeans
 from ssm_graph.graph.inertial_rows import InertialFit
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.mission.fault import DetectedFault, Treatment
-from ssm_graph.smoothers.faults.nuisances import SLOW_AID, SLOW_AIDS, SLOW_BEAM
+from ssm_graph.smoothers.faults.nuisances import DVL, SLOW_AID, SLOW_AIDS, SLOW_BEAM
 from ssm_graph.smoothers.verdict import efficiency
 
 WINDOW_S: Final = 60.0
@@ -151,10 +152,13 @@ def readings_of(
 def disagreeing(readings: Iterable[Readings], keyframe_s: Array) -> list[DetectedFault]:
     """Return the whole windows over which sensors disagree with an answer, time and again.
 
-    Of each sensor one stretch, the surest.
+    Of each sensor one stretch, the surest; where all beams do so, one of the DVL, with the inertial
+    data as the rival.
     """
     found: dict[str, DetectedFault] = {}
+    names = set()
     for one in readings:
+        names.add(one.sensor)
         if len(one.error) <= FEWEST:
             continue
         error, usual = np.clip(one.error, -CLIP, CLIP), SAFE * one.slow
@@ -186,7 +190,24 @@ def disagreeing(readings: Iterable[Readings], keyframe_s: Array) -> list[Detecte
                 rivals=(CONTRADICTING,),
                 remedy="look at its place, mounting and units, and at those of the others",
             )
+    beams = {name for name in names if name.startswith(DVL)}
+    if len(beams) > 1 and beams <= found.keys():
+        return [_of_all([found.pop(name) for name in sorted(beams)]), *found.values()]
     return list(found.values())
+
+
+def _of_all(beams: Sequence[DetectedFault]) -> DetectedFault:
+    """Return the finding of all beams as one of the DVL, or of what all are compared with."""
+    surest = max(beams, key=lambda one: one.chi_sq)
+    return replace(
+        surest,
+        sensor=DVL,
+        what=f"{surest.what}, all beams",
+        begin_s=min(one.begin_s for one in beams),
+        end_s=max(one.end_s for one in beams),
+        rivals=("IMU",),
+        remedy="look at noise, stamps and filters of [imu], and at mounting and units of [dvl]",
+    )
 
 
 def informative(
