@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -66,12 +66,11 @@ def convert(arguments: argparse.Namespace, console: Console, errors: Console) ->
         return write(lambda: _from_rosbag(log, arguments))
     if log.is_file() and is_ardupilot(log):
         return write(lambda: _from_ardupilot(log, arguments))
-    own = ("vehicle", "beams_against")
-    _refuse_ros_options(log, arguments, [name for name in ROS_OPTIONS if name not in own])
+    _refuse_ros_options(log, arguments, but=("vehicle", "beams_against"))
     if not log.exists():
         raise DataError(f"{log}: there is no such file or folder")
     if is_mcap(log):
-        _refuse_ros_options(log, arguments, own)
+        _refuse_ros_options(log, arguments)
         return write(lambda: convert_blueye(log))
     with ProgressDisplay(errors) as show:
         show.stage(f"reading {log}")
@@ -87,9 +86,11 @@ def convert(arguments: argparse.Namespace, console: Console, errors: Console) ->
     return _said(made, arguments, console)
 
 
-def _refuse_ros_options(log: Path, arguments: argparse.Namespace, options: Iterable[str]) -> None:
-    for name in options:
-        if getattr(arguments, name) is not None:
+def _refuse_ros_options(
+    log: Path, arguments: argparse.Namespace, *, but: Collection[str] = ()
+) -> None:
+    for name in ROS_OPTIONS:
+        if name not in but and getattr(arguments, name) is not None:
             too = name in ARDUPILOT_OPTIONS
             raise ConfigError(
                 f"--{name.replace('_', '-')} is for ROS bags{' and logs of ArduPilot' * too}, and "
@@ -100,7 +101,7 @@ def _refuse_ros_options(log: Path, arguments: argparse.Namespace, options: Itera
 def _merge(arguments: argparse.Namespace, console: Console, errors: Console) -> bool:
     """Write the mission of inertial data and recordings of other instruments."""
     own = ARDUPILOT_OPTIONS if any(map(is_ardupilot, arguments.log)) else ("vehicle",)
-    _refuse_ros_options(arguments.log[0], arguments, [o for o in ROS_OPTIONS if o not in own])
+    _refuse_ros_options(arguments.log[0], arguments, but=own)
     if arguments.vehicle is None:
         raise ConfigError("several logs: expected  --vehicle FILE  with noise, mounting and place")
     vehicle, offset_s = read_vehicle(arguments.vehicle), arguments.clock_offset
@@ -126,7 +127,7 @@ def _said(found: Merged, arguments: argparse.Namespace, console: Console) -> boo
 
 
 def _from_ardupilot(log: Path, arguments: argparse.Namespace) -> Mission:
-    _refuse_ros_options(log, arguments, [o for o in ROS_OPTIONS if o not in ARDUPILOT_OPTIONS])
+    _refuse_ros_options(log, arguments, but=ARDUPILOT_OPTIONS)
     vehicle = None if arguments.vehicle is None else read_vehicle(arguments.vehicle)
     return convert_ardupilot(log, vehicle=vehicle, options=_ardupilot_options(arguments))
 
@@ -157,7 +158,7 @@ def _from_tables(
     errors: Console,
 ) -> bool:
     """Write the mission of tables of any columns, and of recordings beside them."""
-    _refuse_ros_options(arguments.log[0], arguments, ROS_OPTIONS[1:])
+    _refuse_ros_options(arguments.log[0], arguments, but=("vehicle",))
     column_map = read_map(arguments.map)
     path = _vehicle_path(arguments)
     if path is None:
