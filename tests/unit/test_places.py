@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import socket
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 
 import numpy as np
 
 from ssm_graph.io.nmea_sentences import checksum
+from ssm_graph.live.protocols.decoder import Decoder
 from ssm_graph.live.protocols.json_messages import JsonDecoder, encode_message
 from ssm_graph.live.protocols.nmea import PREFERRED_S, NmeaDecoder
 from ssm_graph.live.sockets.endpoints import LOOPBACK, Endpoint, Transport
@@ -192,15 +194,24 @@ def test_a_stranger_at_another_port_feeds_no_depths() -> None:
         stray.close()
 
 
-def test_datagrams_of_many_senders_are_told_apart_up_to_a_number() -> None:
-    """Halves of two senders do not meet, and the first of them stays."""
-    clock = Steady()
-    config = InputConfig("any", Endpoint(Transport.UDP, LOOPBACK, 0), JsonDecoder)
+@contextmanager
+def udp(
+    make_decoder: Callable[[], Decoder], clock: Steady
+) -> Iterator[tuple[SocketHub, UdpInput, Receiver]]:
+    """Yield a hub that hears datagrams, its one source, and who reads it."""
+    config = InputConfig("any", Endpoint(Transport.UDP, LOOPBACK, 0), make_decoder)
     with SocketHub([config], steady_s=clock, wall_s=lambda: WALL_S + clock.now_s) as hub:
         receiver = Receiver(hub)
         receiver.poll()
         (source,) = hub.inputs
         assert isinstance(source, UdpInput)
+        yield hub, source, receiver
+
+
+def test_datagrams_of_many_senders_are_told_apart_up_to_a_number() -> None:
+    """Halves of two senders do not meet, and the first of them stays."""
+    clock = Steady()
+    with udp(JsonDecoder, clock) as (hub, source, receiver):
         own = UdpSender(source.port)
         for k in range(MAX_SENDERS + 20):
             clock.now_s += 0.01
@@ -220,12 +231,7 @@ def test_datagrams_of_many_senders_are_told_apart_up_to_a_number() -> None:
 def test_a_socket_for_every_sentence_is_one_instrument() -> None:
     """A compass with no more than HDG: read once nothing better has come for a while."""
     clock = Steady()
-    config = InputConfig("compass", Endpoint(Transport.UDP, LOOPBACK, 0), NmeaDecoder)
-    with SocketHub([config], steady_s=clock, wall_s=lambda: WALL_S + clock.now_s) as hub:
-        receiver = Receiver(hub)
-        receiver.poll()
-        (source,) = hub.inputs
-        assert isinstance(source, UdpInput)
+    with udp(NmeaDecoder, clock) as (hub, source, receiver):
         body = "HCHDG,90.0,,,0.0,E"
         line = f"${body}*{checksum(body)}\r\n".encode()
         senders = []  # kept open, so that no port comes twice
