@@ -77,6 +77,7 @@ def test_gyrocompassing_needs_no_motion_and_no_dvl() -> None:
     assert abs(wrap_to_pi(start.heading - truth[2])) < math.radians(3.0)
 
 
+@pytest.mark.slow
 def test_an_unobservable_heading_is_tried_all_around_and_said() -> None:
     """A hovering MEMS vehicle cannot know its heading; no answer may pretend that it does."""
     run = simulated(Grade.MEMS, scenario="hover", seconds=60.0)

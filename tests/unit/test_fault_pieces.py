@@ -38,8 +38,11 @@ def found_in(*faults: Fault) -> tuple[DetectedFault, ...]:
 
 @pytest.mark.parametrize(
     ("begin_s", "end_s"),
-    [(185.0, 215.0), (105.0, 145.0), (30.0, 220.0)],
-    ids=["in the last piece", "across a seam", "longer than a piece"],
+    [
+        pytest.param(185.0, 215.0, id="in the last piece", marks=pytest.mark.slow),
+        pytest.param(105.0, 145.0, id="across a seam"),
+        pytest.param(30.0, 220.0, id="longer than a piece", marks=pytest.mark.slow),
+    ],
 )
 def test_a_fault_is_found_once_where_it_is(begin_s: float, end_s: float) -> None:
     """One beam by a constant."""

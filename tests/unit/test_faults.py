@@ -115,7 +115,12 @@ LIES = {
 }
 
 
-@pytest.mark.parametrize("name", LIES)
+QUICK = ("a false bottom", "fixes off", "a depth that is off")  # one of each sensor
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in LIES]
+)
 def test_lies_that_last_are_named_and_cost_little(name: str) -> None:
     """Each is the first of all findings, in time to seconds, and is taken off; sigmas hold."""
     fault, sensor = LIES[name]
@@ -166,6 +171,7 @@ def test_a_slow_drift_of_depth_is_covered_whenever_it_began(
     assert errors(estimate, sim)[1] < 4.0
 
 
+@pytest.mark.slow
 def test_nothing_is_found_with_realistic_instruments() -> None:
     """Slow noise, heavy tails, scale factors and misalignments are nobody's fault once stated."""
     for seed in (1, 2):
@@ -219,6 +225,7 @@ def test_the_search_goes_with_calibration() -> None:
     assert found.sensor == "DVL beam 3"
 
 
+@pytest.mark.slow
 def test_the_search_goes_by_further_aids() -> None:
     """Three beams have no parity, and a poor IMU that starts at any velocity believes them all."""
     aids = AidSettings(

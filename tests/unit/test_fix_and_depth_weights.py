@@ -266,6 +266,7 @@ def test_every_fix_is_one_measurement_of_three_components() -> None:
     np.testing.assert_array_equal(weight, np.repeat(weight[:, :1], 3, axis=1))
 
 
+@pytest.mark.slow
 def test_what_is_beyond_the_gate_of_a_window_is_listed_and_never_counts() -> None:
     """Many depths of another unit against a height that nothing else holds: not by a millimetre."""
     mission = surfaced().mission

@@ -114,6 +114,7 @@ def test_gyros_that_read_six_tenths_of_the_turn() -> None:
     assert rms[1] < 1.2 * rms[0] + 0.1
 
 
+@pytest.mark.slow
 def test_a_window_of_the_whole_mission_is_the_batch() -> None:
     """Values, sigmas and track, to a twentieth of a sigma."""
     off = distorted(Grade.MEMS, 5, duration_s=40.0)
@@ -131,6 +132,7 @@ def test_a_window_of_the_whole_mission_is_the_batch() -> None:
     assert np.all(np.abs(off_enu) < 0.05 * batch.trajectory.velocity_sigma_enu)
 
 
+@pytest.mark.slow
 def test_the_live_estimator_finds_what_fixed_lag_finds() -> None:
     """With a stated part, which it takes off; its newest state is led on without either."""
     off = distorted(Grade.MEMS, 3, duration_s=40.0)

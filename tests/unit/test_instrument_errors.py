@@ -150,6 +150,7 @@ def allan_deviation(rate: Array, step_s: float, tau_s: float) -> float:
     return math.sqrt(float(np.mean(second**2)) / (2.0 * tau_s**2))
 
 
+@pytest.mark.slow
 def test_bias_instability_is_the_floor_of_the_allan_deviation() -> None:
     """Flat at the number of the data sheet over two decades, for gyros and accelerometers."""
     errors = InertialErrors(gyro_instability=1e-6, accel_instability=1e-4)

@@ -63,6 +63,7 @@ def drawn_rows(rng: np.random.Generator) -> Iterator[SensorRows]:
         yield SensorRows(name, -white, H, np.ones(3), np.arange(3))
 
 
+@pytest.mark.slow
 def test_separations_are_what_their_covariance_says() -> None:
     """Chi-square of three degrees of freedom: of velocity without DVL, of position without GNSS."""
     guardian, lanes = guardian_of(after("calm")[1])
@@ -157,6 +158,7 @@ def test_good_asks_for_the_protection_level_that_the_user_asks_for() -> None:
         assert "below 0.001 m" in look.navigation.reason
 
 
+@pytest.mark.slow
 def test_settled_states_have_the_levels_of_their_time() -> None:
     """One for every keyframe, finite, also of those that left the window long ago."""
     found, smoother = looks(calm().mission, calm())

@@ -167,6 +167,7 @@ def test_steps_do_not_change_the_answer(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 @pytest.mark.usefixtures("unhurried")
+@pytest.mark.slow
 def test_it_is_said_to_align_until_nothing_is_left_to_catch_up_with() -> None:
     """No answer of the past is given for that of now."""
     vehicle, messages = given(moving())
@@ -253,6 +254,7 @@ def sizes(steps: Steps[object]) -> Array:
     return np.array(list(steps))
 
 
+@pytest.mark.slow
 def test_steps_are_small_however_long_the_data() -> None:
     """A step is a keyframe's, or goes through all of them at once and is small for each."""
     whole = replace(hovering().mission, initial=None)

@@ -134,6 +134,7 @@ def test_outliers_accuse_no_clock(seed: int) -> None:
     assert not find_suspects(mission)
 
 
+@pytest.mark.slow
 def test_other_lies_accuse_no_clock() -> None:
     """A position that jumps, a bottom that moves: no clock, no unit explains them."""
     for fault in (
@@ -201,6 +202,7 @@ def test_a_clock_that_is_set_in_mid_run(fault: Fault, sensor: str) -> None:
     assert found.begin_s == pytest.approx(150.0, abs=15.0)
 
 
+@pytest.mark.slow
 def test_late_depths_and_early_inertial_data() -> None:
     """Depths alone; and inertial data against everybody else."""
     late_s = 0.5
@@ -241,6 +243,7 @@ def test_gyros_of_another_scale(grade: Grade, scale: float, says: str) -> None:
     assert number(found.remedy) == pytest.approx(1.0 / scale, rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_calibration_takes_care_of_the_gyros() -> None:
     """A factor within four of the prior sigmas that the mission states for it."""
     mission = healthy("survey", Grade.MEMS, 51)
@@ -286,6 +289,7 @@ def test_the_atmosphere_in_the_depth() -> None:
     assert number(found.remedy) == pytest.approx(10.13, abs=0.7)
 
 
+@pytest.mark.slow
 def test_a_mounting_by_quarters_and_another_janus_angle() -> None:
     """The line of ``mission.toml`` is the true one."""
     mission = healthy("survey", Grade.TACTICAL, 46)
@@ -354,6 +358,7 @@ def test_who_is_late_where_only_two_can_tell() -> None:
     assert named == {"DVL", "IMU"}
 
 
+@pytest.mark.slow
 def test_the_answer_says_it_first() -> None:
     """The status is SUSPECT, the sentence stands first, the fault is among the estimate's."""
     mission = healthy("survey", Grade.TACTICAL, 46, duration_s=SMOOTHED_S)
@@ -365,6 +370,7 @@ def test_the_answer_says_it_first() -> None:
     assert estimate.faults[0].sensor == "GNSS"
 
 
+@pytest.mark.slow
 def test_a_clock_that_is_taken_off_is_said_once() -> None:
     """Fixes a second late: the line that mends it, of an answer that is right."""
     mission = healthy("survey", Grade.TACTICAL, 46, duration_s=SMOOTHED_S)

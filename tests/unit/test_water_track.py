@@ -214,6 +214,7 @@ def test_a_current_that_nobody_stated_is_assumed_and_said() -> None:
     assert not build_problem(without_beams(sim.mission)).extras
 
 
+@pytest.mark.slow
 def test_a_window_bridges_a_loss_like_the_batch() -> None:
     """As long as the mission, it is the batch; a shorter one is as far off as its sigmas say."""
     sim = in_current(duration_s=60.0, losses=(Loss(15.0, 45.0),))
@@ -273,6 +274,7 @@ def test_alignment_does_not_take_the_water_for_the_ground() -> None:
         np.testing.assert_array_equal(found.velocity_enu, expected.velocity_enu)
 
 
+@pytest.mark.slow
 def test_the_first_pass_goes_through_a_long_loss() -> None:
     """It ends near the answer though one beam of every other ping is wrong, and doubts nothing."""
     sim = in_current(
@@ -305,6 +307,7 @@ def test_a_current_that_jumps_is_met_by_a_new_current() -> None:
     assert np.abs(first.states.v_n - truth.velocity_enu).max() < 0.3
 
 
+@pytest.mark.slow
 def test_the_fault_search_tells_a_beam_from_the_current() -> None:
     """A beam off for minutes is found among pings off the water; a current is nobody's fault."""
     fault = Fault(beams=(2,), start_s=90.0, end_s=210.0, offset_m_per_s=0.3)
@@ -318,6 +321,7 @@ def test_the_fault_search_tells_a_beam_from_the_current() -> None:
     assert abs(found.end_s - 210.0) < 2.0
 
 
+@pytest.mark.slow
 def test_current_and_further_aids_go_together() -> None:
     """Walks and constants of both kinds in one problem, with the search for faults over it."""
     compass = CompassSettings(
