@@ -7,7 +7,6 @@ other: the box is exact along the axes, the ellipsoid knows how components hang 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -214,14 +213,6 @@ def shared(own: Sets, other: Sets) -> tuple[Sets, Mask]:
     kept, empty = _tightened(Sets(both, low, high, own.floor))
     apart = apart | empty
     return kept.where(~apart, own), apart
-
-
-def hull(pieces: Sequence[Sets]) -> tuple[Array, Array]:
-    """Return low and high (..., n) of the smallest box around several sets."""
-    return (
-        np.min([piece.low for piece in pieces], axis=0),
-        np.max([piece.high for piece in pieces], axis=0),
-    )
 
 
 def _onto(size: Array, z: Array) -> Array:
