@@ -42,6 +42,12 @@ def late_keys(owner: str) -> dict[str, Key]:
     }
 
 
+def share_key(owner: str, name: str, hint: str) -> Key:
+    """Return the key of what one component has of a drift's sigma, whose key is ``name``."""
+    beside = (name, f"expected with a {name} above 0, got none")
+    return sigma_key(owner, 10.0, hint, required=False, beside=beside)
+
+
 def drift_keys(name: str, owner: str, high: float, hint: str) -> dict[str, Key]:
     """Return the keys of a drift; ``name`` is that of its sigma, ``owner`` has its fields."""
     stands_with = (name, f"expected with a {name} above 0, got none")

@@ -385,9 +385,10 @@ def stating(mission: Mission, errors: InstrumentErrors) -> Mission:
         share = math.sqrt(z_sq) / level
         dvl = replace(dvl, mount=replace(mount, drift=drift, drift_z_share=share))
     if gnss and errors.gnss:
-        sigma = float(np.mean(gnss.sigma_enu))
-        known = replace(gnss.calibration, drift=errors.gnss.drift(sigma))
-        gnss = replace(gnss, calibration=known)
+        east, north, up = np.sqrt(np.mean(gnss.sigma_enu**2, axis=0)).tolist()
+        level = math.hypot(east, north) / math.sqrt(2.0)
+        drifts = {"drift": errors.gnss.drift(level), "drift_up_share": up / level}
+        gnss = replace(gnss, calibration=replace(gnss.calibration, **drifts))
     if depth and errors.depth:
         known_depth = replace(depth.calibration, drift=errors.depth.drift(depth.sigma))
         depth = replace(depth, calibration=known_depth)
