@@ -16,6 +16,7 @@ References
 
 from __future__ import annotations
 
+import itertools
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -25,8 +26,10 @@ import numpy as np
 
 from factors.kernels import GeneralKernel, TruncatedKernel, fitted_shape
 from factors.similarity import WEIGHT_FLOOR, GaussianKernel, Kernel
+from factors.tails import likeliest_tail, tail_evidence, tails_of
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.times import Indices
 
 NEAR_SIGMAS = 1.0
 """The next kernel takes over once the updates are below this many of their own sigmas."""
@@ -257,3 +260,87 @@ class GncSchedule(Schedule):
         """Return whether every weight is 0 or 1."""
         is_binary = np.minimum(settled, np.abs(1.0 - settled)) <= BINARY
         return self.mu is not None and bool(np.all(is_binary))
+
+
+MOST_TAILS = 8
+"""Passes in which tails may change, after each time that the measurements did; near a tie they
+could go to and fro."""
+
+
+class Lengths(NamedTuple):
+    """Of M measurements at a solution, whitened."""
+
+    square: Array
+    """(M,) squared Mahalanobis lengths ``t``, with the posterior variance in them if asked for"""
+    spread: Array
+    """(M,) the posterior variance ``H P H'`` alone, summed over the components"""
+
+    def telling(self, weights: Array, dim: Array | int) -> Array:
+        """Return the share (M,) of its length that the answer leaves each, by its weight."""
+        return np.clip(1.0 - weights * self.spread / dim, 0.0, 1.0)
+
+
+@final
+@dataclass(frozen=True, slots=True)
+class TailSchedule:
+    """A warm kernel until the updates are near, then for each sensor the likeliest tail.
+
+    Tails and solution take turns until both stay, see :mod:`factors.tails`.
+    """
+
+    wanted: Kernel
+    """With the heaviest tail that any sensor may have"""
+    kernels: tuple[Kernel, ...]
+    """In force, (S,) of the sensors"""
+    begin: Indices
+    """(S + 1,) where the measurements of each begin, and the end"""
+    dim: Indices
+    """(S,) of the measurements"""
+    is_warm: bool = True
+    changes: int = 0
+    """How often tails were changed"""
+    last: Anderson | None = None
+
+    def weight(self, t: Array) -> Array:
+        """Return the weights (M,) of all measurements."""
+        own = [k.weight(t[rows], dim=int(d)) for k, rows, d in self._sensors()]
+        return np.concatenate([np.zeros(0), *own])
+
+    def _sensors(self) -> list[tuple[Kernel, slice, int]]:
+        rows = [slice(a, b) for a, b in itertools.pairwise(self.begin.tolist())]
+        return list(zip(self.kernels, rows, self.dim.tolist(), strict=True))
+
+    def _found(self, lengths: Lengths, weights: Array) -> tuple[Kernel, ...]:
+        tails, found = tails_of(self.wanted), []
+        for _, rows, dim in self._sensors():
+            own = Lengths(*(column[rows] for column in lengths))
+            evidence = tail_evidence(tails, own.square, own.telling(weights[rows], dim), dim=dim)
+            found.append(likeliest_tail(tails, evidence, dim=dim))
+        return tuple(found)
+
+    def after(
+        self, used: Array, settled: Array, lengths: Lengths, *, update_sigmas: float
+    ) -> tuple[TailSchedule, Array]:
+        """Return the schedule and the weights (M,) of the next pass, as other schedules do."""
+        if self.is_warm and update_sigmas >= NEAR_SIGMAS:
+            return self, settled
+        kernels = self._found(lengths, used)
+        if self.changes < MOST_TAILS and (self.is_warm or kernels != self.kernels):
+            changed = replace(
+                self, kernels=kernels, is_warm=False, changes=self.changes + 1, last=None
+            )
+            return changed, changed.weight(lengths.square)
+        if update_sigmas >= NEAR_SIGMAS:
+            return self, settled
+        step = Anderson.after(self.last, used, settled)
+        return replace(self, last=step), step.weights
+
+    def may_end(self, lengths: Lengths, used: Array) -> bool:
+        """Return whether the tails in force are those that the measurements ask for."""
+        if self.is_warm:
+            return False
+        return self.changes >= MOST_TAILS or self._found(lengths, used) == self.kernels
+
+    def anew(self) -> TailSchedule:
+        """Return the same for measurements that have changed."""
+        return replace(self, changes=0, last=None)

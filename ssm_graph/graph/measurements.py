@@ -16,6 +16,7 @@ from factors.similarity import Kernel, LogKernel, Similarity
 from ssm_graph.base import chi2
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.extras import Extras
+from ssm_graph.engine.reweighting import Lengths, TailSchedule
 from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.aid import Aid, Linearised, RowStates
 from ssm_graph.graph.aids.depth import DepthMeans
@@ -137,23 +138,29 @@ class Measurements:
             np.asarray((scale * np.concatenate(jacobians).T).T),
         )
 
-    def mahalanobis_sq(self, states: States, step: StepLike, similarity: Similarity) -> Array:
-        """Return the ``t`` (M,) of the similarity measure."""
+    def lengths(self, states: States, step: StepLike, similarity: Similarity) -> Lengths:
+        """Return the ``t`` of the similarity measure, and the part of the posterior variance."""
         keyframe, error, jacobian = self.rows(states)
-        square = error**2
-        if similarity is Similarity.EXPECTED:
-            square = square + step.variance(keyframe, jacobian)
-        return self._summed(square)
+        spread = self._summed(step.variance(keyframe, jacobian))
+        square = self._summed(error**2)
+        return Lengths(square + spread if similarity is Similarity.EXPECTED else square, spread)
+
+    def tails(self, wanted: Kernel, warm: Kernel) -> TailSchedule:
+        """Return how they are weighed beside beams weighed by ``wanted``, at first by ``warm``."""
+        sizes = [len(aid) for aid in self.all]
+        begin = np.cumsum([0, *sizes]).astype(np.intp)
+        dim = np.array([aid.dim for aid in self.all], np.intp)
+        return TailSchedule(aid_kernel(wanted), (warm,) * len(sizes), begin, dim)
 
     def squares(self, states: States) -> Array:
         """Return the squared whitened errors (M,)."""
         return self._summed(self.rows(states).error ** 2)
 
-    def loss(self, states: States, kernel: Kernel) -> float:
-        """Return what they cost with their robust loss in place of their squares."""
+    def loss(self, states: States, kernels: Sequence[Kernel]) -> float:
+        """Return what they cost with the robust loss of each aid in place of their squares."""
         t, total = self.squares(states), 0.0
-        for dim in np.unique(self.dim):
-            own = t[self.dim == dim]
+        for aid, kernel in zip(self.all, kernels, strict=True):
+            own, dim = self.of(aid, t), aid.dim
             loss = kernel.similarity(np.zeros_like(own), dim=dim) - kernel.similarity(own, dim=dim)
             total += float(loss.sum())
         return total

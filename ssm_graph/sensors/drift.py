@@ -31,15 +31,21 @@ class Drift:
 
 ARM_SIGMA: Final = (0.0, 100.0, "the unit is metres")
 """Limits of the key of a doubted lever arm."""
-_SECONDS: Final = "the unit is seconds, not milliseconds"
+SECONDS: Final = "the unit is seconds, not milliseconds"
 
 
 def late_keys(owner: str) -> dict[str, Key]:
     """Return the keys of a clock that is late; ``owner`` has the fields."""
     return {
-        "time_offset_s": optional_key(f"{owner}.time_offset_s", -10.0, 10.0, _SECONDS),
-        "time_offset_sigma_s": optional_key(f"{owner}.time_offset_sigma_s", 0.0, 10.0, _SECONDS),
+        "time_offset_s": optional_key(f"{owner}.time_offset_s", -10.0, 10.0, SECONDS),
+        "time_offset_sigma_s": optional_key(f"{owner}.time_offset_sigma_s", 0.0, 10.0, SECONDS),
     }
+
+
+def share_key(owner: str, name: str, hint: str) -> Key:
+    """Return the key of what one component has of a drift's sigma, whose key is ``name``."""
+    beside = (name, f"expected with a {name} above 0, got none")
+    return sigma_key(owner, 10.0, hint, required=False, beside=beside)
 
 
 def drift_keys(name: str, owner: str, high: float, hint: str) -> dict[str, Key]:

@@ -31,7 +31,7 @@ from ssm_graph.base.settings import (
 from ssm_graph.base.tables import Table
 from ssm_graph.base.units import DEGREE, PER_SQRT_H, in_unit
 from ssm_graph.sensors import dvl_readings as readings
-from ssm_graph.sensors.drift import ARM_SIGMA, drift_keys, late_keys
+from ssm_graph.sensors.drift import ARM_SIGMA, drift_keys, late_keys, share_key
 from ssm_graph.sensors.dvl import (
     MOST_BEAMS,
     DvlLog,
@@ -137,10 +137,8 @@ _KEYS: Final = {
     "lever_arm_sigma_m": optional_key("mount.lever_arm_sigma", *ARM_SIGMA),
     "water_noise_m_per_s": sigma_key("", 5.0, _SPEED_UNIT, required=False),
     **drift_keys("drift_sigma_m_per_s", "mount.drift", 5.0, _SPEED_UNIT),
-    "drift_z_share": sigma_key(
-        *("mount.drift_z_share", 10.0, "four beams at 30 degrees make it 0.41"),
-        required=False,
-        beside=("drift_sigma_m_per_s", "expected with a drift_sigma_m_per_s above 0, got none"),
+    "drift_z_share": share_key(
+        "mount.drift_z_share", "drift_sigma_m_per_s", "four beams at 30 degrees make it 0.41"
     ),
 }
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.settings import FILE_KEY, LEVER_ARM_KEY, optional_key
-from ssm_graph.sensors.drift import ARM_SIGMA, Drift, drift_keys, late_keys
+from ssm_graph.sensors.drift import ARM_SIGMA, Drift, drift_keys, late_keys, share_key
 from ssm_graph.sensors.instrument import Calibrated
 from ssm_graph.sensors.place import (
     POSITION,
@@ -32,6 +32,8 @@ class GnssCalibration:
     """Prior sigma of each component of the lever arm, m; above zero asks for its calibration."""
     drift: Drift = Drift()
     """What fixes are off by slowly, each of east, north and up, m."""
+    drift_up_share: float = 1.0
+    """Of its sigma, what the component up has; receivers know heights half as well as places."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,6 +59,9 @@ _KEYS: Final = {
     "lever_arm_sigma_m": optional_key("calibration.lever_arm_sigma", *ARM_SIGMA),
     **late_keys("calibration"),
     **drift_keys("drift_sigma_m", "calibration.drift", 1000.0, "the unit is metres"),
+    "drift_up_share": share_key(
+        "calibration.drift_up_share", "drift_sigma_m", "heights that err twice as much make it 2"
+    ),
 }
 
 

@@ -84,15 +84,22 @@ class ImuLog(FrozenArrays):
 
     @property
     def calibrated(self) -> ImuLog:
-        """The log with what is known of scale, misalignment and g-sensitivity taken off.
+        """The log with what is known of delay, scale, misalignment, g-sensitivity taken off.
 
         The sigmas of what is left are kept, the values are none: once more changes nothing.
         """
-        known = self.calibration
-        if not known.is_stated:
+        known, late_s = self.calibration, self.calibration.time_offset_s
+        if not (known.is_stated or late_s):
             return self
         gyro_b, accel_b = known.taken_off(self.gyro_b, self.accel_b)
-        return replace(self, gyro_b=gyro_b, accel_b=accel_b, calibration=known.exact())
+        return replace(
+            self,
+            start_s=self.start_s - late_s,
+            time_s=self.time_s - late_s,
+            gyro_b=gyro_b,
+            accel_b=accel_b,
+            calibration=known.exact(),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,7 +284,8 @@ class _Imu(Instrument):
         return ImuSample(time_s, (gx, gy, gz), (ax, ay, az))
 
     def log_of(self, rows: Array, bare: ImuLog) -> ImuLog:
-        return replace(bare, time_s=rows[:, 0], gyro_b=rows[:, 1:4], accel_b=rows[:, 4:7])
+        time_s = rows[:, 0] + self.late_s(bare)
+        return replace(bare, time_s=time_s, gyro_b=rows[:, 1:4], accel_b=rows[:, 4:7])
 
 
 IMU: Final = _Imu(
@@ -287,6 +295,7 @@ IMU: Final = _Imu(
     (_GYRO, _ACCEL),
     ImuSample,
     "i",
+    late="calibration.time_offset_s",
     calibrated=CALIBRATED,
     is_required=True,
 )

@@ -22,6 +22,7 @@ from ssm_graph.base.frames import MATRIX_PLACES
 from ssm_graph.base.frozen import Array, FrozenArrays, optional_shaped
 from ssm_graph.base.settings import Key, optional_key
 from ssm_graph.base.units import DEG_PER_H, MICRO_G
+from ssm_graph.sensors.drift import SECONDS
 from ssm_graph.sensors.instrument import Calibrated, compounded
 
 PPM: Final = 1e-6
@@ -66,10 +67,12 @@ class ImuCalibration(FrozenArrays):
     """1"""
     accel_misalignment_sigma: float = 0.0
     """rad"""
+    time_offset_s: float = 0.0
+    """How late stamps are, s: latency and the group delay of the unit's filters."""
 
     @property
     def is_stated(self) -> bool:
-        """Whether any error is known."""
+        """Whether any error of the readings is known."""
         values = (getattr(self, name) for name in VALUES)
         return any(value is not None and bool(value.any()) for value in values)
 
@@ -81,7 +84,7 @@ class ImuCalibration(FrozenArrays):
     def exact(self) -> ImuCalibration:
         """Return what is asked for of sensors whose known errors are taken off."""
         none: dict[str, Any] = dict.fromkeys(VALUES)
-        return replace(self, **none) if self.is_stated else self
+        return replace(self, **none, time_offset_s=0.0)
 
     def taken_off(self, gyro_b: Array, accel_b: Array) -> tuple[Array, Array]:
         """Return readings (N, 3) of gyros and accelerometers without what is known."""
@@ -106,12 +109,16 @@ def _matrix(*parts: Array | None) -> Array:
 _PPM_HINT: Final = "the unit is ppm, millionths: 1 % is 10000"
 _MRAD_HINT: Final = "the unit is milliradians: 1 degree is 17.45"
 _G_HINT: Final = "the unit is deg/h per g"
+MOST_LATE_S: Final = 1.0
+"""s; filters of a unit are ten times as fast, and what is later belongs to another clock."""
 
 
 def calibration_keys(owner: str) -> dict[str, Key]:
     """Return the keys of the calibration; ``owner`` is the field that has it."""
     matrix: dict[str, Any] = {"is_body_matrix": True}
-    keys: dict[str, Key] = {}
+    keys = {
+        "time_offset_s": optional_key(f"{owner}.time_offset_s", -MOST_LATE_S, MOST_LATE_S, SECONDS)
+    }
     for sensor in ("gyro", "accel"):
         scale, misalignment = f"{owner}.{sensor}_scale", f"{owner}.{sensor}_misalignment"
         keys |= {

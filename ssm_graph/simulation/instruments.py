@@ -24,6 +24,8 @@ from ssm_graph.simulation.randomness import SlowPart, Streams, regular_gauss_mar
 
 _G: Final = 9.80665
 _PPM: Final = 1e-6
+GROUP_DELAY: Final = math.sqrt(2.0) / (2.0 * math.pi)
+"""Of a Butterworth filter of two poles far below its end, in the inverse of that."""
 
 FLICKER_S: Final = (1.0, 10.0, 100.0, 1000.0, 10000.0)
 """Correlation times of the Gauss-Markov processes whose sum has a density like ``1 / f``, s."""
@@ -66,9 +68,13 @@ class InertialErrors(checked.Settings):
     is_averaging: bool = True
     """Whether a sample is the mean of the vibration over its interval, or one of its values."""
     low_pass_hz: float | None = checked.positive(None, hint="leave it out for none")
-    """Where the sensor's filter of two poles ends, which makes it late by 0.225 over this."""
+    """Where the sensor's filter of two poles ends, which makes it late by
+    :data:`GROUP_DELAY` over this."""
     late_s: float = checked.not_negative(0.0, hint="try 0.002 s")
     """Samples are stamped later than they are by this much, s, filter not counted."""
+    late_tolerance: float = checked.not_negative(0.05, hint="write 5 % as 0.05")
+    """Sigma of the very unit's ``late_s`` by that of its data sheet, drawn once a mission: the
+    oscillators of such units are good to some per cent."""
     gyro_range: float | None = checked.positive(None, hint="500 deg/s is 8.7")
     """Readings end here, rad/s; None for nowhere."""
     accel_range: float | None = checked.positive(None, hint="4 g is 39")
@@ -89,7 +95,19 @@ class InertialErrors(checked.Settings):
             gyro_g_sensitivity_sigma=self.g_sensitivity,
             accel_scale_sigma=self.accel_scale,
             accel_misalignment_sigma=self.accel_misalignment,
+            time_offset_s=self.delay_s,
         )
+
+    def drawn_late_s(self, streams: Streams) -> float:
+        """Return how late the stamps of a very unit are, s, filter not counted."""
+        off = float(streams.of("imu delay").standard_normal())
+        return max(self.late_s * (1.0 + self.late_tolerance * off), 0.0)
+
+    @property
+    def delay_s(self) -> float:
+        """How late readings are by the data sheet, s: latency and group delay of the filter."""
+        filtered_s = GROUP_DELAY / self.low_pass_hz if self.low_pass_hz else 0.0
+        return self.late_s + filtered_s
 
 
 _DOF: Final = checked.Rule(
@@ -367,9 +385,10 @@ def stating(mission: Mission, errors: InstrumentErrors) -> Mission:
         share = math.sqrt(z_sq) / level
         dvl = replace(dvl, mount=replace(mount, drift=drift, drift_z_share=share))
     if gnss and errors.gnss:
-        sigma = float(np.mean(gnss.sigma_enu))
-        known = replace(gnss.calibration, drift=errors.gnss.drift(sigma))
-        gnss = replace(gnss, calibration=known)
+        east, north, up = np.sqrt(np.mean(gnss.sigma_enu**2, axis=0)).tolist()
+        level = math.hypot(east, north) / math.sqrt(2.0)
+        drifts = {"drift": errors.gnss.drift(level), "drift_up_share": up / level}
+        gnss = replace(gnss, calibration=replace(gnss.calibration, **drifts))
     if depth and errors.depth:
         known_depth = replace(depth.calibration, drift=errors.depth.drift(depth.sigma))
         depth = replace(depth, calibration=known_depth)

@@ -204,7 +204,7 @@ def _reference_times(config: SimulationConfig, end_s: float) -> Array:
 def _imu(config: SimulationConfig, streams: Streams, n_samples: int) -> tuple[ImuLog, ReadImu]:
     """Return the log, and what is true of it."""
     rate_hz, inertial = config.imu_rate_hz, config.errors.inertial
-    late_s = inertial.late_s if inertial else 0.0
+    late_s = inertial.drawn_late_s(streams) if inertial else 0.0
     gyro_b, accel_b = averaged_imu(
         config.trajectory, rate_hz=rate_hz, n_samples=n_samples, late_s=late_s
     )

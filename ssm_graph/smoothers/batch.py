@@ -27,14 +27,14 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps, at_once
 from ssm_graph.engine.chain import ChainSolution
 from ssm_graph.engine.error_state import STATE_DIM
-from ssm_graph.engine.reweighting import Schedule, WarmSchedule
+from ssm_graph.engine.reweighting import Lengths, Schedule, TailSchedule
 from ssm_graph.engine.states import States
 from ssm_graph.graph.beacon_start import ambiguous_beacons
 from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.first_values import FirstValues, first_values, first_values_steps
 from ssm_graph.graph.inertial_rows import InertialFit, inertial_fit
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.measurements import JudgedAid, aid_kernel, aid_table, doubts_of_aids, without
+from ssm_graph.graph.measurements import JudgedAid, Measurements, aid_table, doubts_of_aids, without
 from ssm_graph.mission.answer import trajectory_from_states
 from ssm_graph.mission.estimate import BeamTable, Estimate, Iteration, NoiseFound, Status
 from ssm_graph.mission.fault import DetectedFault
@@ -66,12 +66,8 @@ RUNAWAY_SPEED = 1e4
 
 
 def _notes_of(first: FirstValues) -> tuple[str, ...]:
-    if first.n_doubts == 0:
-        return ()
-    return (
-        f"the first pass doubted its prediction {first.n_doubts} times: the beams contradicted it "
-        "together",
-    )
+    said = "the first pass doubted its prediction {} times: the beams contradicted it together"
+    return (said.format(first.n_doubts),) if first.n_doubts else ()
 
 
 def warm_start(problem: Problem) -> FirstValues:
@@ -89,7 +85,7 @@ class Pass(NamedTuple):
     """(M,) of the beams"""
     weights: Array
     """(M,) that these lead to"""
-    aid_mahalanobis_sq: Array
+    aid_lengths: Lengths
     """(A,) of the measurements of weighted aids"""
     aid_weights: Array
     """(A,)"""
@@ -105,13 +101,13 @@ class Weights(NamedTuple):
     aids: Array
     """(A,)"""
     of_beams: Schedule
-    of_aids: Schedule
+    of_aids: TailSchedule
 
     @classmethod
-    def begin(cls, config: SmootherConfig, first: FirstValues) -> Weights:
+    def begin(cls, config: SmootherConfig, first: FirstValues, aids: Measurements) -> Weights:
         """Return those of the first pass, after the forward pass."""
         of_beams = config.schedule()
-        of_aids = WarmSchedule(aid_kernel(config.kernel), WARM_KERNEL)
+        of_aids = aids.tails(config.kernel, WARM_KERNEL)
         return cls(of_beams.first_weights(first.weights), first.aid_weights, of_beams, of_aids)
 
     def after(self, last: Pass, faults: FaultWatch) -> Weights:
@@ -120,13 +116,13 @@ class Weights(NamedTuple):
             self.beams, last.weights, t=last.mahalanobis_sq, update_sigmas=last.update_sigmas
         )
         of_aids, aids = self.of_aids.after(
-            self.aids, last.aid_weights, t=last.aid_mahalanobis_sq, update_sigmas=last.update_sigmas
+            self.aids, last.aid_weights, last.aid_lengths, update_sigmas=last.update_sigmas
         )
         return Weights(faults.leave_out(beams), faults.leave_aids_out(aids), of_beams, of_aids)
 
     def may_end(self, last: Pass) -> bool:
         """Return whether the weights that the pass led to may be those of the answer."""
-        of_aids = len(self.aids) == 0 or self.of_aids.may_end(last.aid_weights)
+        of_aids = len(self.aids) == 0 or self.of_aids.may_end(last.aid_lengths, self.aids)
         return of_aids and self.of_beams.may_end(last.weights)
 
 
@@ -139,6 +135,8 @@ class Solved(NamedTuple):
     status: Status
     kernel: Kernel
     """That of the answer"""
+    aid_kernels: tuple[Kernel, ...]
+    """Those of each weighted aid"""
     notes: tuple[str, ...]
     first: FirstValues
     faults: tuple[DetectedFault, ...]
@@ -218,7 +216,7 @@ class SsmSmoother:
         rows = linearizer.beam_rows(states)
         faults = FaultWatch(white, self.config.fault_search)
         yield 0.03 * problem.n_keyframes
-        weights = Weights.begin(self.config, first)
+        weights = Weights.begin(self.config, first, linearizer.weighted)
         iterations: list[Iteration] = []
         status = Status.MAX_ITERATIONS
         for number in range(self.config.max_iterations):
@@ -244,7 +242,8 @@ class SsmSmoother:
             if changed is not None:
                 linearizer, states = changed.linearizer, changed.states
                 rows, anew = linearizer.beam_rows(states), self.config.schedule()
-                weights = Weights(changed.weights, changed.aid_weights, anew, weights.of_aids)
+                of_aids = weights.of_aids.anew()
+                weights = Weights(changed.weights, changed.aid_weights, anew, of_aids)
                 continue
             if is_settled:
                 status = Status.CONVERGED
@@ -261,7 +260,8 @@ class SsmSmoother:
         kernel = weights.of_beams.wanted
         notes = (*problem.notes, *(fault.sentence for fault in found), *_notes_of(first))
         ended = (linearizer, this, tuple(iterations), status)
-        return Solved(*ended, kernel, notes, first, found, faults.aids_out, inertial)
+        kernels = kernel, weights.of_aids.kernels
+        return Solved(*ended, *kernels, notes, first, found, faults.aids_out, inertial)
 
     def _with_sigmas_steps(
         self, linearizer: GraphLinearizer, last: Pass, used: Weights, faults: FaultWatch
@@ -274,10 +274,9 @@ class SsmSmoother:
             DVL, t, weights, beams_s, used.of_beams.kernel, freed=linearizer.has_freed_beam
         )
         beams = says / faults.inflation_of(DVL)
-        for aid in aids.all:
-            own = aids.of(aid, last.aid_mahalanobis_sq), aids.of(aid, last.aid_weights)
-            of = keyframe_s[aid.keyframe], used.of_aids.kernel
-            says, noise = informative(aid.name, *own, *of, dim=aid.dim)
+        for aid, kernel in zip(aids.all, used.of_aids.kernels, strict=True):
+            own = aids.of(aid, last.aid_lengths.square), aids.of(aid, last.aid_weights)
+            says, noise = informative(aid.name, *own, keyframe_s[aid.keyframe], kernel, dim=aid.dim)
             aids.of(aid, known)[:] = says / faults.inflation_of(aid.name)
             found.append(noise)
         step = yield from linearizer.solve_steps(
@@ -319,8 +318,8 @@ class SsmSmoother:
         t = self._mahalanobis_sq(problem, rows, step)
         settled = faults.leave_out(used.of_beams.kernel.weight(t))
         aids = linearizer.weighted
-        aid_t = aids.mahalanobis_sq(states, step, self.config.judged_by)
-        aid_settled = faults.leave_aids_out(used.of_aids.kernel.weight(aid_t, dim=aids.dim))
+        lengths = aids.lengths(states, step, self.config.judged_by)
+        aid_settled = faults.leave_aids_out(used.of_aids.weight(lengths.square))
         change = np.concatenate([settled - used.beams, aid_settled - used.aids])
         return Pass(
             states,
@@ -328,7 +327,7 @@ class SsmSmoother:
             rows,
             t,
             settled,
-            aid_t,
+            lengths,
             aid_settled,
             update_sigmas=float(np.max(np.abs(wanted) / sigma)),
             weight_change=float(np.max(np.abs(change), initial=0.0)),
@@ -342,14 +341,15 @@ class SsmSmoother:
             spread = step.variance(beams.keyframe, H)
         return expected_mahalanobis_sq(rows.error, spread, sigma=beams.sigma)
 
-    def _cost(self, linearizer: GraphLinearizer, last: Pass, kernel: Kernel) -> float:
+    def _cost(self, solved: Solved) -> float:
         """Return the cost with the robust losses of beams and aids for their weighted squares."""
+        linearizer, last, kernel = solved.linearizer, solved.last, solved.kernel
         rows = last.beam_rows
         t = (rows.error / linearizer.problem.beams.sigma) ** 2
         loss = kernel.similarity(np.zeros_like(t)) - kernel.similarity(t)
         aids = linearizer.weighted
         others = linearizer.cost(last.states, rows, np.zeros_like(t), np.zeros(len(aids)))
-        return others + float(np.sum(loss)) + aids.loss(last.states, aid_kernel(kernel))
+        return others + float(np.sum(loss)) + aids.loss(last.states, solved.aid_kernels)
 
     def _estimate(self, solved: Solved, noise: NoiseFound, *, wall_s: float) -> Estimate:
         linearizer, last, status = solved.linearizer, solved.last, solved.status
@@ -358,7 +358,7 @@ class SsmSmoother:
             f"{last.weight_change:.1e}"
         )
         judged = linearizer.weighted.judged(
-            last.states, linearizer.problem.keyframe_s, last.aid_mahalanobis_sq, last.aid_weights
+            last.states, linearizer.problem.keyframe_s, last.aid_lengths.square, last.aid_weights
         )
         doubts = self._doubts(solved, judged)
         if doubts:
@@ -389,7 +389,7 @@ class SsmSmoother:
             ),
             iterations=solved.iterations,
             wall_s=wall_s,
-            cost=self._cost(linearizer, last, solved.kernel),
+            cost=self._cost(solved),
             start=problem.start,
             faults=solved.faults,
             notes=solved.notes + noise_notes(noise) + undetermined(calibration),

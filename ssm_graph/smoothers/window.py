@@ -229,6 +229,8 @@ class Window:
         oldest_s = keyframe.time_s - self.config.lag_s - MIN_SPACING_S
         leaving = sum(known.time_s < oldest_s for known in self.keyframes)
         left, last = self._stretch(0, leaving), self.newest_states
+        if self.config.lag_s > 0.0:  # the filter weighs all sensors by one kernel, as published
+            self._graph.aids.find_tails(self.config.kernel, leaving)
         pinged = slice(int(self._graph.first_row[-2]), None)
         beam, weight = self._graph.beams.beam[pinged], self._weights[pinged]
         self._trust = updated_trust(self._trust, beam, weight)

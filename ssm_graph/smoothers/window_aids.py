@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple, Self
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factors.similarity import WEIGHT_FLOOR, Kernel, Similarity
+from factors.tails import likeliest_tail, tail_evidence, tails_of
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.times import Indices
+from ssm_graph.engine.reweighting import Lengths
 from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.aid import Aid, Rows, RowStates
 from ssm_graph.graph.aids.depth import DepthMeans
@@ -23,6 +25,11 @@ from ssm_graph.smoothers.keyframe import Keyframe, Sensors
 def row_states(sensors: Sensors, states: States) -> RowStates:
     """Return the states as rows take them; gravity, which none here asks for, is left out."""
     return RowStates(*states, sensors.extras, np.zeros(3))
+
+
+REMEMBERED: Final = 600.0
+"""Measurements that left the window tell the tail of their sensor; so many more make them count for
+a third. Three times what it takes to outweigh the doubt before the first."""
 
 
 class SensorRows(NamedTuple):
@@ -52,6 +59,8 @@ class _Measured(NamedTuple):
     """(M,)"""
     t: Array
     """(M,)"""
+    spread: Array
+    """(M,) the posterior variance in it"""
     is_out: NDArray[np.bool_]
     """(M,) which were too far from their prediction to get any weight later"""
 
@@ -61,6 +70,12 @@ class _Measured(NamedTuple):
             return self
         columns: tuple[Any, ...] = tuple(column[rows] for column in self[1:])
         return _Measured(self.aid.take(rows), *columns)
+
+    def evidence(self, tails: tuple[Kernel, ...]) -> Array:
+        """Return how likely (C,) each of some tails makes them."""
+        dim = self.aid.dim
+        telling = Lengths(self.t, self.spread).telling(self.weight, dim)
+        return tail_evidence(tails, self.t, telling, dim=dim)
 
     def replaced(self, rows: slice, by: _Measured) -> _Measured:
         """Return these with as many others in the place of successive ones."""
@@ -99,11 +114,16 @@ class WindowAids:
     def __init__(self, sensors: Sensors) -> None:
         self._sensors = sensors
         self._all: dict[str, _Measured] = {}
+        self._left: dict[str, Array] = {}
+        """(C,) evidence for tails, of what has left the window"""
+        self._kernels: dict[str, Kernel] = {}
+        """The tails found"""
 
     def copy(self) -> Self:
         """Return the same, to go its own way."""
         twin = type(self)(self._sensors)
-        twin._all = dict(self._all)
+        twin._all, twin._left = dict(self._all), dict(self._left)
+        twin._kernels = dict(self._kernels)
         return twin
 
     @property
@@ -131,7 +151,8 @@ class WindowAids:
     def _linearised(self, aid: Aid, at: RowStates) -> _Measured:
         error, jacobian = aid.whitened(at)
         n = len(aid)
-        return _Measured(aid, error, jacobian, np.ones(n), np.zeros(n), np.zeros(n, bool))
+        none = np.zeros(n)
+        return _Measured(aid, error, jacobian, np.ones(n), none, none, np.zeros(n, bool))
 
     def linearise(self, begin: int, end: int, at: States) -> None:
         """Linearise those of successive keyframes anew at the states (K, ...) of all.
@@ -154,7 +175,7 @@ class WindowAids:
                 here = row_states(self._sensors, at.take(k[:n_first]))
                 first = aid.take(np.s_[:n_first]).led_along(None, here)
                 led = first.followed_by(led) if n_first < len(k) else first
-            anew = _Measured(led, *led.whitened(own), some.weight, some.t, some.is_out)
+            anew = _Measured(led, *led.whitened(own), *some[3:])
             self._all[name] = one.replaced(rows, anew)
 
     def drop(self, count: int) -> None:
@@ -165,6 +186,23 @@ class WindowAids:
             for name, one in kept.items()
             if len(one.aid)
         }
+
+    def find_tails(self, kernel: Kernel, leaving: int) -> None:
+        """Give each sensor the likeliest tail, the heaviest being that of ``kernel``.
+
+        The first ``leaving`` keyframes are about to go; what they tell is kept.
+        """
+        tails = tails_of(aid_kernel(kernel))
+        for name in self._weighted:
+            one = self._all[name]
+            left = self._left.get(name, np.zeros(0))
+            left = left if len(left) == len(tails) else np.zeros(len(tails))
+            gone = one.take(one.rows_of(0, leaving))
+            if len(gone.aid):
+                left = left * np.exp(-len(gone.aid) / REMEMBERED) + gone.evidence(tails)
+                self._left[name] = left
+            evidence = left + one.take(one.rows_of(leaving, 1 << 62)).evidence(tails)
+            self._kernels[name] = likeliest_tail(tails, evidence, dim=one.aid.dim)
 
     def rows(self, begin: int) -> tuple[Indices, Array]:
         """Return the weighted rows (R, n + 1) from a keyframe on, and the keyframe of each."""
@@ -253,7 +291,7 @@ class WindowAids:
             spread = ((J @ covariance[k]) * J).sum(axis=(-2, -1))
             if similarity is Similarity.EXPECTED:
                 t = t + spread
-            self._all[name] = one._replace(t=t)
+            self._all[name] = one._replace(t=t, spread=spread)
             pulls.append(np.sqrt(t * spread))
         return np.concatenate(pulls)
 
@@ -263,13 +301,10 @@ class WindowAids:
 
     def settled(self, kernel: Kernel) -> Array:
         """Return the weights (M,) that the present ``t`` ask for."""
-        kernel = aid_kernel(kernel)
         settled = [np.zeros(0)]
         for name in self._weighted:
-            one = self._all[name]
-            settled.append(
-                np.where(one.is_out, WEIGHT_FLOOR, kernel.weight(one.t, dim=one.aid.dim))
-            )
+            one, own = self._all[name], self._kernels.get(name, aid_kernel(kernel))
+            settled.append(np.where(one.is_out, WEIGHT_FLOOR, own.weight(one.t, dim=one.aid.dim)))
         return np.concatenate(settled)
 
     @property
@@ -321,7 +356,10 @@ class WindowAids:
                 yield f"aid_{name}_{column}", array
             yield f"aid_{name}_weight_now", one.weight
             yield f"aid_{name}_t_now", one.t
+            yield f"aid_{name}_spread_now", one.spread
             yield f"aid_{name}_out_now", one.is_out.astype(np.float64)
+        for name, left in self._left.items():
+            yield f"aid_{name}_left_tails", left
 
     @classmethod
     def unpack(cls, arrays: Mapping[str, Array], sensors: Sensors, at: States) -> Self:
@@ -330,12 +368,17 @@ class WindowAids:
         for name, template in sensors.aids.items():
             prefix = f"aid_{name}_"
             own = {n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)}
+            if "left_tails" in own:
+                aids._left[name] = own.pop("left_tails")
             if own:
                 aid = template.unpack(own)
                 anew = aids._linearised(aid, row_states(sensors, at.take(aid.keyframe)))
-                is_out = own.get("out_now", np.zeros(len(aid))) > 0.0  # older ones have none
+                none = np.zeros(len(aid))  # older ones have no such columns
                 aids._all[name] = anew._replace(
-                    weight=own["weight_now"], t=own["t_now"], is_out=is_out
+                    weight=own["weight_now"],
+                    t=own["t_now"],
+                    spread=own.get("spread_now", none),
+                    is_out=own.get("out_now", none) > 0.0,
                 )
         return aids
 

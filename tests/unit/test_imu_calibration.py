@@ -203,6 +203,51 @@ def test_what_is_known_is_taken_off_the_readings() -> None:
     )
 
 
+LATE_S = 0.015
+
+
+def test_a_known_delay_is_taken_off_the_stamps(tmp_path: Path) -> None:
+    """Late by a sample and a half and said to be so: the answers are those of stamps on time."""
+    mission = turning(duration_s=10.0, imu_rate_hz=100.0).mission
+    imu, late = mission.imu, ImuCalibration(time_offset_s=LATE_S)
+    stamps = {"start_s": imu.start_s + LATE_S, "time_s": imu.time_s + LATE_S}
+    write_mission(tmp_path, replace(mission, imu=replace(imu, calibration=late, **stamps)))
+    off = read_mission(tmp_path)
+    assert off.imu.calibration.time_offset_s == LATE_S
+    np.testing.assert_allclose(off.imu.time_s, imu.time_s + LATE_S, rtol=0.0, atol=1e-9)
+    falsely = replace(mission, imu=replace(imu, calibration=late))
+    right, ours, wrong = (
+        SsmSmoother().solve(build_problem(m)).trajectory for m in (mission, off, falsely)
+    )
+    np.testing.assert_allclose(ours.roll_pitch_heading, right.roll_pitch_heading, atol=1e-7)
+    np.testing.assert_allclose(ours.velocity_enu, right.velocity_enu, atol=1e-6)
+    turned = wrong.roll_pitch_heading[:9] - right.roll_pitch_heading[:9]
+    assert np.abs(turned).max() > 1e-4
+    answers = []
+    for one in (mission, off):
+        estimator = FixedLagSmoother(vehicle_of(one))
+        for message in sorted(messages_of(one), key=lambda message: message.time_s):
+            estimator.push(message)
+        assert estimator.counts == {}
+        answer = estimator.newest()
+        assert answer is not None
+        answers.append(answer)
+    assert answers[1].time_s == pytest.approx(answers[0].time_s, abs=1e-9)
+    attitudes = [a.roll_pitch_heading for a in answers]
+    np.testing.assert_allclose(attitudes[1], attitudes[0], rtol=0.0, atol=1e-5)
+
+
+def test_a_delay_in_milliseconds_is_refused(tmp_path: Path) -> None:
+    """Named with its limits."""
+    write_mission(tmp_path, mission_fixture.make_mission())
+    path = tmp_path / "mission.toml"
+    settings = tomllib.loads(path.read_text())
+    settings["imu"]["time_offset_s"] = 5.0
+    path.write_text(tomli_w.dumps(settings))
+    with pytest.raises(ConfigError, match=r"\[imu\] time_offset_s: expected a number from -1 to 1"):
+        read_mission(tmp_path)
+
+
 NO_SIGMAS: dict[str, Any] = {"gyro_scale_sigma": 0.0, "accel_misalignment_sigma": 0.0}
 
 

@@ -349,3 +349,25 @@ def test_sizes_grow_from_grade_to_grade() -> None:
         assert len(set(values)) == 4
     for grade in Grade:
         assert INERTIAL_ERRORS[grade].gyro_instability <= IMU_NOISE[grade].gyro_bias_sigma
+
+
+@pytest.mark.parametrize("grade", list(Grade))
+def test_a_preset_states_the_delay_of_its_data_sheet(grade: Grade) -> None:
+    """Latency and filter, which the very unit keeps to a few per cent."""
+    errors = INERTIAL_ERRORS[grade]
+    filtered_s = {Grade.MEMS: 0.225 / 40.0}.get(grade, 0.0)
+    assert errors.asked.time_offset_s == pytest.approx(errors.late_s + filtered_s, rel=1e-3)
+    late_s = np.array([errors.drawn_late_s(spawn_streams(seed)) for seed in range(60)])
+    unit = (late_s / errors.late_s - 1.0) / errors.late_tolerance
+    low, high = chi2.ppf([5e-4, 1.0 - 5e-4], df=len(unit))
+    assert low < np.sum(unit**2) < high
+
+
+def test_slow_errors_of_fixes_are_stated_along_each_axis() -> None:
+    """As they are drawn: half of each sigma, in height as of height."""
+    config = SimulationConfig(duration_s=5.0, gnss=FIXES, realistic=True, calibrates=True)
+    gnss = simulate(config).mission.gnss
+    assert gnss is not None
+    known = gnss.calibration
+    stated = known.drift.sigma * np.array([1.0, 1.0, known.drift_up_share])
+    np.testing.assert_allclose(stated, 0.5 * gnss.sigma_enu[0])

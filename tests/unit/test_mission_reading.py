@@ -11,6 +11,7 @@ import pytest
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.extras import Extras
+from ssm_graph.graph.aids.gnss import GNSS_DRIFT
 from ssm_graph.io.mission_folder.folder import read_mission
 from ssm_graph.mission.calibration import DVL_DRIFT, extras_of
 from ssm_graph.mission.mission import Mission
@@ -349,7 +350,7 @@ def test_drifts_are_read(tmp_path: Path) -> None:
     """Of DVL and GNSS; all of the noise stays white unless a share is given."""
     dvl = "drift_sigma_m_per_s = 0.006\ndrift_correlation_s = 20\ndrift_white_share = 0.25"
     dvl += "\ndrift_z_share = 0.41"
-    gnss = "drift_sigma_m = 0.5\ndrift_correlation_s = 120"
+    gnss = "drift_sigma_m = 0.5\ndrift_correlation_s = 120\ndrift_up_share = 2"
     mission = read_after(
         tmp_path, toml("\n[depth]", f"{dvl}\n\n[depth]"), toml("\n[gnss]", f"\n[gnss]\n{gnss}")
     )
@@ -362,6 +363,8 @@ def test_drifts_are_read(tmp_path: Path) -> None:
     kept, grown = Extras((drift,)).transitions(np.array([1.0, 1e4]))
     np.testing.assert_allclose(np.hypot(kept * steady, grown), steady)
     assert mission.gnss.calibration.drift == Drift(0.5, 120.0, 1.0)
+    of_fixes = next(one for one in extras_of(mission).blocks if one.name == GNSS_DRIFT)
+    np.testing.assert_allclose(of_fixes.sigma, [0.5, 0.5, 1.0])
 
 
 @pytest.mark.parametrize(

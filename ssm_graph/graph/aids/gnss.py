@@ -137,4 +137,5 @@ def gnss_variables(calibration: GnssCalibration) -> tuple[Extra, ...]:
         Extra(GNSS_LEVER_ARM, along_axes("gnss_lever_arm_{}_m"), arm_sigma, as_a_turn=1e2),
         Extra(GNSS_TIME_OFFSET, ("gnss_time_offset_s",), late_sigma_s, as_a_turn=1e1),
     )
-    return (*known, *drift_variable(GNSS_DRIFT, along_axes("gnss_drift_{}_m"), calibration.drift))
+    labels, shares = along_axes("gnss_drift_{}_m"), np.array([1.0, 1.0, calibration.drift_up_share])
+    return (*known, *drift_variable(GNSS_DRIFT, labels, calibration.drift, shares=shares))

@@ -172,8 +172,9 @@ class Buffers:
         last = rows.index(end_s) + 1 + margin
         found = rows.all[first:last]
         start_s = rows.all[first - 1, 0] if first else found[0, 0] - self.period_s
-        log: ImuLog = IMU.log_of(found, self._bare[IMU.section])
-        return replace(log, start_s=float(start_s)).calibrated
+        bare = self._bare[IMU.section]
+        log: ImuLog = IMU.log_of(found, bare)
+        return replace(log, start_s=float(start_s) + IMU.late_s(bare)).calibrated
 
     def inertial(self, rows: Array) -> Array:
         """Return inertial rows (N, 7) with what is known of the sensors' errors taken off."""

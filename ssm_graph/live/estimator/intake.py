@@ -118,8 +118,8 @@ class Intake:
 
     def _accept_sample(self, sample: ImuSample, now_s: float) -> float | None:
         """Take an inertial sample where one may be: next, after a gap, or in one."""
-        time_s, period_s = sample.time_s, self.buffers.period_s
-        if self._is_known(sample):
+        time_s, period_s = self.buffers.time_of(sample), self.buffers.period_s
+        if self.buffers.has(sample):
             self.counts["imu repeated"] += 1
             return None
         is_next = now_s < time_s <= now_s + max(NEXT_S, 20.0 * period_s)
@@ -129,15 +129,6 @@ class Intake:
         if self.horizon_s <= time_s < now_s and self._is_missing(time_s, period_s):
             return time_s if self._add(sample) else None
         return self._meet_another_clock(sample, now_s, period_s)
-
-    def _is_known(self, sample: ImuSample) -> bool:
-        """Return whether this very sample has come before."""
-        rows = self.buffers.imu
-        at = rows.index(sample.time_s)
-        if at == len(rows):
-            return False
-        known: list[float] = rows.all[at].tolist()
-        return known == [sample.time_s, *sample.gyro_b, *sample.accel_b]
 
     def _is_missing(self, time_s: float, period_s: float) -> bool:
         """Return whether a late sample has room of its own."""
@@ -154,10 +145,11 @@ class Intake:
         row.append(sample)
         if len(row) < CLOCK_SAMPLES:
             self._refuse(
-                sample, now_s, "clock", f"stamped {sample.time_s - now_s:+.2f} s off the last one"
+                *(sample, now_s, "clock"),
+                f"stamped {self.buffers.time_of(sample) - now_s:+.2f} s off the last one",
             )
             return None
-        samples, off_s = row.copy(), row[0].time_s - now_s
+        samples, off_s = row.copy(), self.buffers.time_of(row[0]) - now_s
         row.clear()
         if off_s < 0.0:
             self.shift_s += period_s - off_s
@@ -168,7 +160,7 @@ class Intake:
         self._events.tell(samples[-1].time_s, Severity.WARNING, f"clock_{what[0]}", what[1])
         for waiting in samples:
             self._add(waiting)
-        return samples[0].time_s
+        return self.buffers.time_of(samples[0])
 
     def _add(self, message: Message) -> bool:
         is_new = self.buffers.add(message)
