@@ -75,7 +75,7 @@ class Fault:
     rivals: tuple[Fault, ...] = ()
     """Others that explain the data as well"""
     onsets: tuple[Fault, ...] = ()
-    """The same ramp from other times on, at which it may have begun"""
+    """The same from other times on, or to others, at which it may have begun or ended"""
     sizes: Array | None = None
     """Of its numbers, taken off the rows already; None for what is new"""
     cost_m: float = 0.0

@@ -162,7 +162,11 @@ def joined(one: Fault, later: Fault, seam: int) -> Fault:
             first, second = (rival, same) if stronger is one else (same, rival)
             rival = joined(first, second, seam)
         rivals.append(rival)
-    onsets = tuple(replace(ramp, end=end) for ramp in stronger.onsets if ramp.begin < end)
+    onsets = tuple(
+        replace(other, end=end)
+        for other in stronger.onsets
+        if other.begin < end and other.end == stronger.end
+    )
     return replace(stronger, begin=begin, end=end, rivals=tuple(rivals), onsets=onsets)
 
 

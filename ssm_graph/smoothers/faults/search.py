@@ -8,7 +8,7 @@ first solution may be far off.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -282,8 +282,12 @@ def rivals_of(
 def onsets_of(ramp: Fault, judged: Judged) -> tuple[Fault, ...]:
     """Return a ramp with the first, the likeliest and the last onset that explain the data.
 
-    Only those a block or more away from others count; of what is no ramp there are none.
+    Only those a block or more away from others count. Of a bias of the inertial data, which begins
+    and ends between keyframes, both intervals beside each of its ends have sizes of their own. Of
+    what is neither there are none.
     """
+    if ramp.hypothesis.channel == IMU:
+        return tuple(_beside_edges(ramp, judged))
     if ramp.hypothesis.course is not Course.RAMP:
         return ()
     grid = judged.grid
@@ -295,6 +299,17 @@ def onsets_of(ramp: Fault, judged: Judged) -> tuple[Fault, ...]:
         if np.min(np.abs(edge_s[known] - edge_s[at])) >= grid.block_s:
             known.append(int(at))
     return tuple(replace(ramp, begin=int(grid.edges[at])) for at in known[1:])
+
+
+def _beside_edges(bias: Fault, judged: Judged) -> Iterator[Fault]:
+    """Yield a bias that begins, or ends, a keyframe before or after, as large as it is at most."""
+    first, last = judged.grid.edges[[0, -1]].tolist()
+    sized = as_large_as_alone(bias, judged, [])
+    for shift in (-1, 1):
+        for one in (replace(sized, begin=bias.begin + shift), replace(sized, end=bias.end + shift)):
+            is_inside = first < bias.begin if one.end == bias.end else bias.end < last
+            if is_inside and first <= one.begin < one.end <= last:
+                yield one
 
 
 def as_large_as_alone(fault: Fault, judged: Judged, others: Sequence[Fault]) -> Fault:

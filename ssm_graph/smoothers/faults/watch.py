@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,10 @@ from ssm_graph.smoothers.faults.windows import noisier_than_stated
 
 MOST_LOOKS = 8
 """Looks after which the search ends whatever it finds."""
+SLOW: Final = 0.7
+"""Of the update before, from which on a pass hardly comes nearer, and"""
+SLOW_PASSES: Final = 3
+"""how many such passes in a row are waited for."""
 
 
 class Changed(NamedTuple):
@@ -77,6 +81,7 @@ class FaultWatch:
         self.aids_out = np.zeros(sum(len(aid) for aid in aids_of(problem)), bool)
         """(A,) measurements of aids that may have read anything"""
         self._n_looks, self._is_done = 0, search is None
+        self._last_update, self._n_slow = np.inf, 0
 
     def leave_out(self, weights: Array) -> Array:
         """Return the weights (M,) with the floor for beams that may have read anything."""
@@ -96,7 +101,7 @@ class FaultWatch:
         """
         if self._is_done or self._bare is None or self._search is None:
             return None
-        if update_sigmas >= NEAR_SIGMAS:
+        if update_sigmas >= NEAR_SIGMAS and not self._is_slow(update_sigmas):
             return None
         self._n_looks += 1
         own = states.constants[: self._problem.extras.n_constants]
@@ -140,6 +145,16 @@ class FaultWatch:
             self.leave_out(linear.beam_weights),
             self.leave_aids_out(np.concatenate([np.zeros(0), *linear.aid_weights.values()])),
         )
+
+    def _is_slow(self, update_sigmas: float) -> bool:
+        """Return whether passes come no nearer: what is off bends the answer beyond their reach."""
+        is_slower = update_sigmas > SLOW * self._last_update
+        self._n_slow = self._n_slow + 1 if is_slower else 0
+        self._last_update = update_sigmas
+        if self._n_slow < SLOW_PASSES:
+            return False
+        self._n_slow = 0
+        return True
 
     def inflation_of(self, name: str) -> float:
         """Return by how much readings of the DVL, or of an aid, say less than white noise would."""
@@ -263,9 +278,9 @@ def said(fault: Fault) -> str:
     if sizes is None:
         return "reads what nothing else agrees with"
     d, minute = hypothesis.combined.shape[1], 60.0 / TREND_S
+    sizes = sum((other.sizes for other in fault.onsets if other.sizes is not None), sizes)
     if hypothesis.course is Course.RAMP:
-        last = sum((ramp.sizes for ramp in fault.onsets if ramp.sizes is not None), sizes)
-        return f"from nothing on, and within each minute by {hypothesis.say(minute * last)}"
+        return f"from nothing on, and within each minute by {hypothesis.say(minute * sizes)}"
     text = hypothesis.say(sizes[:d])
     if hypothesis.course is Course.TREND:
         text += f", and within a minute more by {hypothesis.say(minute * sizes[d:])}"
