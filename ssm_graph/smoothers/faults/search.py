@@ -92,9 +92,29 @@ class Look:
         self._work = 0.2 * (piece[1] - piece[0])
         self.hypotheses = hypotheses_of(channels, significance=settings.significance)
 
-    def unstated(self, known: Sequence[Fault]) -> Unstated | None:
-        """Return what instruments err in beyond what they state, beside what was found."""
-        return self._judge.unstated(self._grid(with_rivals(known)), with_rivals(known))
+    def unstated(self, known: Sequence[Fault]) -> tuple[Unstated | None, list[Fault]]:
+        """Return what instruments err in beyond what they state, beside what was found.
+
+        Where biases seem to wander, but one that has jumped explains all of it, that comes, too: a
+        vehicle at an even speed that turns by a little more looks like one that is pushed aside.
+        """
+        grid, others = self._grid(with_rivals(known)), with_rivals(known)
+        found = self._judge.unstated(grid, others)
+        if found is None or not found.has_wandering_biases:
+            return found, []
+        left = self._judge.with_steady_biases().on(grid).with_freed(others)
+        inertial = [one for one in self.hypotheses if one.channel == IMU]
+        jumps = [fault_of(one, left) for one in left.best_of(inertial) if one.is_significant]
+        if not jumps or jumps[0].merit <= 0.0:
+            return found, []
+        rest = self._judge.unstated(self._grid([*others, jumps[0]]), [*others, jumps[0]])
+        if rest is not None and rest.has_wandering_biases:
+            return found, []
+        best, *rivals = [
+            as_large_as_alone(replace(jumps[0], hypothesis=one), left, [])
+            for one in sorted(inertial, key=lambda one: one is not jumps[0].hypothesis)
+        ]
+        return found, [replace(best, rivals=tuple(rivals))]
 
     def find_steps(self, known: Sequence[Fault]) -> Steps[list[Fault]]:
         """Return what is off: what was before, as it competes now, and what is new."""
@@ -253,13 +273,18 @@ def fault_of(candidate: Candidate, judged: Judged) -> Fault:
 def chosen_of(ranked: Sequence[Candidate]) -> Candidate | None:
     """Return what is to be freed, None if nothing is significant; inertial data come last.
 
-    Biases over stretches explain a part of anything.
+    Biases over stretches explain a part of anything. But what even readings that may be anything
+    explain less well is their fault.
     """
     significant = [one for one in ranked if one.is_significant]
     if not significant:
         return None
     best = significant[0]
-    others = (one for one in significant if one.hypothesis.channel != IMU)
+    others = (
+        one
+        for one in significant
+        if one.hypothesis.channel != IMU and one.hypothesis.course is not Course.ANYTHING
+    )
     other = next(others, best)
     return other if other.merit > INERTIAL_SHARE * best.merit else best
 

@@ -74,9 +74,11 @@ class FaultWatch:
         """what it found, if the search ended without settling"""
         self._unstated: Unstated | None = None
         """What instruments were found to err in beyond what they state"""
+        self._undecided: list[Fault] = []
+        """The last of what was found: what may be instead of that, which is judged no more"""
         self._contradicted: list[DetectedFault] = []
         """What the inertial data contradicted before that was allowed for"""
-        self._is_statement_judged = False
+        self._is_statement_judged = self._is_let_back = False
         self._beams_out = np.zeros(len(problem.beams.speed), bool)
         self.aids_out = np.zeros(sum(len(aid) for aid in aids_of(problem)), bool)
         """(A,) measurements of aids that may have read anything"""
@@ -114,11 +116,18 @@ class FaultWatch:
         channels = Channels(linear)
         judge = Judge(linear, channels, Nuisances(linear, channels))
         yield 0.02 * self._problem.n_keyframes
-        found = yield from self._search.find_steps(judge, channels, self._sized(states))
+        known = self._sized(states)[: len(self._found) - len(self._undecided)]
+        found = yield from self._search.find_steps(judge, channels, known)
+        found.extend(self._undecided)
         is_same = same_faults(found, self._found, self._problem.keyframe_s)
+        if is_same and not self._is_let_back:
+            self._is_let_back = True
+            found = let_back(found)
+            is_same = len(found) == len(self._found)
         if is_same and not self._is_statement_judged:
             self._is_statement_judged = True
-            self._unstated = self._search.unstated(judge, channels, self._sized(states))
+            self._unstated, self._undecided = self._search.unstated(judge, channels, known)
+            found.extend(self._undecided)
             if self._unstated is not None:
                 is_same = False
                 fit = inertial_fit(linear.inertial_rows(), linear.solution)
@@ -132,7 +141,9 @@ class FaultWatch:
         if self._is_done:
             self._gone = beside(self._found, found, self._problem.keyframe_s)
             self._new = beside(found, self._found, self._problem.keyframe_s)
-        self._found = sorted(found, key=lambda fault: (fault.begin, fault.end))
+        n_decided = len(found) - len(self._undecided)
+        decided = sorted(found[:n_decided], key=lambda fault: (fault.begin, fault.end))
+        self._found = [*decided, *self._undecided]
         self._leave_out(channels)
         freed, problem = self._freed(channels), self._problem
         if len(freed.sigma):
@@ -264,6 +275,15 @@ class FaultWatch:
             replace(one, remedy="; ".join([*lines, one.remedy])) for one in self._contradicted
         ]
         return (*found, *(left or before))
+
+
+def let_back(found: list[Fault]) -> list[Fault]:
+    """Return what was found without what may have read anything, unless that is all.
+
+    Rows that count for nothing say no more, and they were left out before the others were found.
+    """
+    others = [fault for fault in found if fault.hypothesis.course is not Course.ANYTHING]
+    return others or found
 
 
 def late_of(fault: Fault) -> float | None:
