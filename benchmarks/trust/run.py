@@ -3,6 +3,7 @@
 ``python -m benchmarks.trust.run --keep`` (hours; a quick look is ``--seeds 2 --grades tactical``;
 the same command again does what is missing).
 Missions of 400 s, DVL 5 mm/s; what lies, when and by how much is drawn for every seed.
+With ``--drawn`` the kind is drawn, too, and two sensors may lie at once.
 """
 
 from __future__ import annotations
@@ -16,14 +17,17 @@ import numpy as np
 
 from benchmarks.processes import all_done, tell
 from benchmarks.report import Option, Report, number_text, table
+from benchmarks.trust.drawn import drawn
 from benchmarks.trust.lies import LIES
 from ssm_graph import Estimate, SsmGraphError, evaluate, smooth
 from ssm_graph.base.code_version import code_version
 from ssm_graph.simulation import (
     AidSettings,
     DvlSettings,
+    Fault,
     GnssSettings,
     Grade,
+    Sensor,
     SimulatedMission,
     SimulationConfig,
     SpiralRoute,
@@ -41,6 +45,8 @@ BEYOND = 5.0
 """Sigmas of an error that its sigma does not cover."""
 SHARES = (1.0, 2.0, 3.0)
 """Sigmas inside which errors are counted."""
+DRAWN = "drawn"
+"""Label of what is of any kind."""
 
 
 class Run(NamedTuple):
@@ -54,6 +60,8 @@ class Run(NamedTuple):
     is_named: bool
     """Whether the verdict names the sensor that lies, over a time that has to do with the lie"""
     seconds: float
+    kind: str = ""
+    """Of what was drawn"""
 
     @property
     def is_right(self) -> bool:
@@ -69,6 +77,11 @@ class Run(NamedTuple):
     def is_covered(self) -> bool:
         """Whether the sigmas cover the error, in an answer that names who lies."""
         return self.z <= BEYOND and self.is_named
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether it is neither right nor said, and not inside its sigmas."""
+        return not (self.is_right or self.is_said or self.z <= BEYOND)
 
     @property
     def is_deceived(self) -> bool:
@@ -104,23 +117,47 @@ def mission_of(
     )
 
 
+class Case(NamedTuple):
+    """What lies in a mission."""
+
+    faults: tuple[Fault, ...]
+    named: tuple[tuple[str, ...], ...]
+    """Of each the words of which the verdict has to use one"""
+    with_gnss: bool
+    kind: str = ""
+
+
+def case_of(label: str, seed: int) -> Case:
+    """Draw what lies in the mission of a seed; fixes without need every other seed."""
+    rng = np.random.default_rng([seed, *label.encode()])
+    if label == DRAWN:
+        found = drawn(rng, DURATION_S)
+        has_fixes = seed % 2 == 0 or any(one.kind.sensor is Sensor.GNSS for one in found)
+        return Case(
+            tuple(one.fault for one in found),
+            tuple(one.named for one in found),
+            has_fixes,
+            ", ".join(one.kind.label for one in found),
+        )
+    lie = LIES[label]
+    has_fixes = seed % 2 == 0 if lie.with_gnss is None else lie.with_gnss
+    fault = lie.draw(rng, DURATION_S)
+    faults = fault if isinstance(fault, tuple) else (fault,)
+    return Case(faults, (lie.named,) * len(faults), has_fixes)
+
+
 def run(key: Key) -> Row:
     """Smooth one mission (label, grade, seed, is realistic) with its lie, and as the oracle."""
     label, grade, seed, realistic = str(key[0]), str(key[1]), int(key[2]), bool(key[3])
-    rng = np.random.default_rng([seed, *label.encode()])
-    lie = LIES[label]
-    with_gnss = seed % 2 == 0 if lie.with_gnss is None else lie.with_gnss
-    sim = mission_of(grade, seed, with_gnss=with_gnss, realistic=realistic)
-    drawn = lie.draw(rng, DURATION_S)
-    faults = drawn if isinstance(drawn, tuple) else (drawn,)
-    broken = with_faults(sim.mission, faults, truth=sim.truth_at, seed=seed)
-    span_s = min(f.start_s for f in faults), max(min(f.end_s, DURATION_S) for f in faults)
+    case = case_of(label, seed)
+    sim = mission_of(grade, seed, with_gnss=case.with_gnss, realistic=realistic)
+    broken = with_faults(sim.mission, case.faults, truth=sim.truth_at, seed=seed)
     begin = time.process_time()
     try:
         estimate = smooth(broken.mission)
     except SsmGraphError as error:
-        is_named = bool(re.search("|".join(lie.named), str(error)))
-        return Run(np.inf, np.inf, "REFUSED", is_named, np.nan)._asdict()
+        is_named = all(re.search("|".join(words), str(error)) for words in case.named)
+        return Run(np.inf, np.inf, "REFUSED", is_named, np.nan, case.kind)._asdict()
     seconds = time.process_time() - begin
     found = errors_of(sim, estimate)
     oracle = errors_of(sim, smooth(broken.told(sim.mission)))
@@ -128,8 +165,12 @@ def run(key: Key) -> Row:
         ratio=max(np.divide(found.rms_m, oracle.rms_m)),
         z=found.z,
         status=estimate.status.name,
-        is_named=_names(estimate, lie.named, *span_s),
+        is_named=all(
+            _names(estimate, words, fault.start_s, min(fault.end_s, DURATION_S))
+            for fault, words in zip(case.faults, case.named, strict=True)
+        ),
         seconds=seconds,
+        kind=case.kind,
     )._asdict()
 
 
@@ -206,6 +247,18 @@ def line(label: str, grade: str, runs: Sequence[Run]) -> list[str]:
     ]
 
 
+def lost(cells: Sequence[tuple[Key, Run]]) -> list[str]:
+    """Return a table of the missions that are neither right nor said, and beyond their sigmas."""
+    rows = []
+    for key, run in cells:
+        if run.is_lost:
+            z, is_named = number_text(run.z), "yes" if run.is_named else "no"
+            what = (run.kind or str(key[0]), str(key[1]), str(key[2]))
+            rows.append([*what, run.status, f"{run.ratio:.3g}", z, is_named])
+    header = ("what lies", "grade", "seed", "status", "ratio", "z, sigma", "named")
+    return ["", "Neither right nor said, and beyond 5 sigma:", "", *table(header, rows)]
+
+
 def main() -> None:
     """Run all missions and write the tables."""
     report = Report(
@@ -214,12 +267,13 @@ def main() -> None:
         Option("--first-seed", 20_000, "where they begin"),
         Option("--grades", "navigation,tactical", "names with commas between them"),
         Option("--only", "", "lies whose names have this in them"),
+        Option("--drawn", False, "one row a grade, of faults of any kind, one or two at once"),
         Option("--realistic", False, "lies on realistic instruments, too"),
         Option("--jobs", 2, "missions at a time"),
     )
     args = report.args
     seeds = range(args.first_seed, args.first_seed + args.seeds)
-    labels = [label for label in LIES if args.only in label]
+    labels = [DRAWN] if args.drawn else [label for label in LIES if args.only in label]
     cells = [(label, grade) for label in labels for grade in args.grades.split(",")]
     cases: list[Key] = [(*cell, seed, args.realistic) for cell in cells for seed in seeds]
     ledger = Ledger(args.out / f"{code_version()}.jsonl", {"benchmark": "trust.run"})
@@ -229,7 +283,8 @@ def main() -> None:
         line(*cell, runs[i * len(seeds) : (i + 1) * len(seeds)]) for i, cell in enumerate(cells)
     ]
     about = f"Seeds {seeds.start} to {seeds.stop - 1}; missions of {DURATION_S:g} s."
-    report.write([about, "", LEGEND, *table(HEADER, rows)])
+    failed = lost(list(zip(cases, runs, strict=True)))
+    report.write([about, "", LEGEND, *table(HEADER, rows), *failed])
 
 
 if __name__ == "__main__":

@@ -40,6 +40,34 @@ class NavigationStates(NamedTuple):
         turn = _EYE + jacobians.skew @ J
         return self._at(step, turn=turn, shift_b=(J @ step[:, POSITION, None])[..., 0])
 
+    def swung(self, step: Array) -> NavigationStates:
+        """Return the states moved by local errors (B, 15), velocity and position turned along.
+
+        To first order that is :meth:`moved`. Where all are turned by much, what the inertial data
+        say from one to the next, and velocities in body axes, stay as the errors to first order
+        have them: the errors in navigation axes are those of the group of extended poses, in which
+        they propagate linearly [1]_.
+
+        References
+        ----------
+        .. [1] A. Barrau, S. Bonnabel, "The Invariant Extended Kalman Filter as a Stable Observer",
+           IEEE Transactions on Automatic Control 62, 2017.
+        """
+        phi_n = (self.R_nb @ step[:, ROTATION, None])[..., 0]
+        shift_n = (self.R_nb @ step[:, POSITION, None])[..., 0]
+        turn, J = so3.exp(phi_n), so3.left_jacobian(phi_n)
+
+        def turned(value: Array, by: Array) -> Array:
+            own = by - np.cross(phi_n, value)
+            return np.asarray((turn @ value[..., None] + J @ own[..., None])[..., 0])
+
+        return NavigationStates(
+            R_nb=turn @ self.R_nb,
+            p_n=turned(self.p_n, shift_n),
+            v_n=turned(self.v_n, step[:, VELOCITY]),
+            bias=self.bias + step[:, 9:],
+        )
+
     def displaced(self, xi: Array) -> NavigationStates:
         """Return the states at deviations (B, 15): the inverse of :meth:`deviation_of`."""
         return self._at(xi, turn=so3.exp(xi[:, ROTATION]), shift_b=xi[:, POSITION])
@@ -114,12 +142,16 @@ class States(NamedTuple):
         R_nb, p_n, v_n, bias, walks = (column[0] for column in self[:5])
         return InitialMoments(R_nb, p_n, v_n, bias, covariance, walks)
 
-    def moved(self, step: Array, constants_step: Array | None = None) -> States:
+    def moved(
+        self, step: Array, constants_step: Array | None = None, *, swings: bool = False
+    ) -> States:
         """Return the states moved by local errors (K, 15 + s), the pose as GTSAM retracts it.
 
-        ``constants_step`` is (C,); the constants stay as they are when it is left out.
+        ``constants_step`` is (C,); the constants stay as they are when it is left out. With
+        ``swings`` velocity and position are turned along, see :meth:`NavigationStates.swung`.
         """
-        own = self.navigation.moved(step[:, :STATE_DIM])
+        move = self.navigation.swung if swings else self.navigation.moved
+        own = move(step[:, :STATE_DIM])
         constants = self.constants if constants_step is None else self.constants + constants_step
         return States(*own, walks=self.walks + step[:, STATE_DIM:], constants=constants)
 

@@ -27,14 +27,14 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps, at_once
 from ssm_graph.engine.chain import ChainSolution
 from ssm_graph.engine.error_state import STATE_DIM
-from ssm_graph.engine.reweighting import Lengths, Schedule, TailSchedule
+from ssm_graph.engine.reweighting import NEAR_SIGMAS
 from ssm_graph.engine.states import States
 from ssm_graph.graph.beacon_start import ambiguous_beacons
 from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.first_values import FirstValues, first_values, first_values_steps
 from ssm_graph.graph.inertial_rows import InertialFit, inertial_fit
 from ssm_graph.graph.linearize import GraphLinearizer
-from ssm_graph.graph.measurements import JudgedAid, Measurements, aid_table, doubts_of_aids, without
+from ssm_graph.graph.measurements import JudgedAid, aid_table, doubts_of_aids, without
 from ssm_graph.mission.answer import trajectory_from_states
 from ssm_graph.mission.estimate import BeamTable, Estimate, Iteration, NoiseFound, Status
 from ssm_graph.mission.fault import DetectedFault
@@ -44,9 +44,16 @@ from ssm_graph.mission.problem import Problem, with_white_noise
 from ssm_graph.smoothers.descent import descend_steps
 from ssm_graph.smoothers.faults.nuisances import DVL
 from ssm_graph.smoothers.faults.watch import FaultWatch
-from ssm_graph.smoothers.faults.windows import disagreeing, informative, readings_of
+from ssm_graph.smoothers.faults.windows import (
+    disagreeing,
+    informative,
+    noisy_or_compared,
+    readings_of,
+)
+from ssm_graph.smoothers.passes import Pass, Weights
 from ssm_graph.smoothers.settings import WARM_KERNEL, SmootherConfig
 from ssm_graph.smoothers.track import calibration_of, current_of, undetermined
+from ssm_graph.smoothers.unwound import unwound_steps
 from ssm_graph.smoothers.verdict import (
     MAX_ADAPTATIONS,
     adaptation,
@@ -73,57 +80,6 @@ def _notes_of(first: FirstValues) -> tuple[str, ...]:
 def warm_start(problem: Problem) -> FirstValues:
     """Return the states and weights that every smoother of this problem starts from."""
     return first_values(with_white_noise(problem), kernel=WARM_KERNEL)
-
-
-class Pass(NamedTuple):
-    """What one pass came to."""
-
-    states: States
-    step: ChainSolution
-    beam_rows: BeamRows
-    mahalanobis_sq: Array
-    """(M,) of the beams"""
-    weights: Array
-    """(M,) that these lead to"""
-    aid_lengths: Lengths
-    """(A,) of the measurements of weighted aids"""
-    aid_weights: Array
-    """(A,)"""
-    update_sigmas: float
-    weight_change: float
-
-
-class Weights(NamedTuple):
-    """Of one pass, and the schedules that say by which kernels they are judged."""
-
-    beams: Array
-    """(M,)"""
-    aids: Array
-    """(A,)"""
-    of_beams: Schedule
-    of_aids: TailSchedule
-
-    @classmethod
-    def begin(cls, config: SmootherConfig, first: FirstValues, aids: Measurements) -> Weights:
-        """Return those of the first pass, after the forward pass."""
-        of_beams = config.schedule()
-        of_aids = aids.tails(config.kernel, WARM_KERNEL)
-        return cls(of_beams.first_weights(first.weights), first.aid_weights, of_beams, of_aids)
-
-    def after(self, last: Pass, faults: FaultWatch) -> Weights:
-        """Return those of the pass after ``last``."""
-        of_beams, beams = self.of_beams.after(
-            self.beams, last.weights, t=last.mahalanobis_sq, update_sigmas=last.update_sigmas
-        )
-        of_aids, aids = self.of_aids.after(
-            self.aids, last.aid_weights, last.aid_lengths, update_sigmas=last.update_sigmas
-        )
-        return Weights(faults.leave_out(beams), faults.leave_aids_out(aids), of_beams, of_aids)
-
-    def may_end(self, last: Pass) -> bool:
-        """Return whether the weights that the pass led to may be those of the answer."""
-        of_aids = len(self.aids) == 0 or self.of_aids.may_end(last.aid_lengths, self.aids)
-        return of_aids and self.of_beams.may_end(last.weights)
 
 
 class Solved(NamedTuple):
@@ -218,7 +174,7 @@ class SsmSmoother:
         yield 0.03 * problem.n_keyframes
         weights = Weights.begin(self.config, first, linearizer.weighted)
         iterations: list[Iteration] = []
-        status = Status.MAX_ITERATIONS
+        status, is_unwound = Status.MAX_ITERATIONS, False
         for number in range(self.config.max_iterations):
             try:
                 this = yield from self._iterate(linearizer, states, rows, weights, faults)
@@ -234,8 +190,14 @@ class SsmSmoother:
                 on_iteration(number + 1, self.config.max_iterations, iterations[-1])
             is_settled = max(this.update_sigmas, this.weight_change) < self.config.tolerance
             is_settled = is_settled and weights.may_end(this)
-            changed = None
-            if number + 1 < self.config.max_iterations:
+            changed, is_last = None, number + 1 == self.config.max_iterations
+            if this.update_sigmas < NEAR_SIGMAS and not (is_unwound or is_last):
+                is_unwound, wound = True, states
+                states = yield from unwound_steps(linearizer, states, this)
+                if states is not wound:
+                    rows, weights = linearizer.beam_rows(states), weights.after(this, faults)
+                    continue
+            if not is_last:
                 changed = yield from faults.look_steps(
                     linearizer, states, update_sigmas=this.update_sigmas
                 )
@@ -270,9 +232,10 @@ class SsmSmoother:
         problem, aids, known = linearizer.problem, linearizer.weighted, np.ones(len(used.aids))
         t, weights, keyframe_s = last.mahalanobis_sq, last.weights, problem.keyframe_s
         beams_s = keyframe_s[problem.beams.keyframe]
-        says, *found = informative(
+        says, noisy = informative(
             DVL, t, weights, beams_s, used.of_beams.kernel, freed=linearizer.has_freed_beam
         )
+        found = [noisy and noisy_or_compared(noisy, problem.beams)]
         beams = says / faults.inflation_of(DVL)
         for aid, kernel in zip(aids.all, used.of_aids.kernels, strict=True):
             own = aids.of(aid, last.aid_lengths.square), aids.of(aid, last.aid_weights)

@@ -17,9 +17,15 @@ from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.measurements import doubts_of_aids
 from ssm_graph.mission.answer import SUSPECT_STRETCH_S
 from ssm_graph.mission.estimate import Status
+from ssm_graph.mission.fault import DetectedFault, Treatment
 from ssm_graph.mission.problem import Problem, build_problem
 from ssm_graph.simulation import DiveRoute, GnssSettings, Grade, SimulatedMission, TransitRoute
-from ssm_graph.smoothers.faults.windows import informative, most_by_noise
+from ssm_graph.smoothers.faults.windows import (
+    informative,
+    most_by_noise,
+    noisy_or_compared,
+    parity_of,
+)
 from ssm_graph.smoothers.verdict import LEAST_EFFICIENCY, contradictions, efficiency
 from tests.helpers import outcome, simulated, true_states, with_imu, with_initial
 
@@ -80,6 +86,23 @@ def test_noise_that_a_lie_leaves_is_not_said(*, is_freed: bool) -> None:
     assert (found is None) == is_freed
     assert (np.mean((says * weights)[is_off]) < 0.05) == is_freed
     assert np.min(says[time_s < 200.0]) >= LEAST_EFFICIENCY
+
+
+@pytest.mark.parametrize(("noise", "sensor"), [(1.0, "IMU"), (3.0, "DVL")])
+def test_beams_that_agree_are_not_called_noisy(noise: float, sensor: str) -> None:
+    """A velocity that nobody predicted is in no beam's noise, nor is one beam's offset."""
+    _, problem, _ = long_mission()
+    beams, rng = problem.beams, np.random.default_rng(3)
+    own = beams.sigma * noise * rng.standard_normal(len(beams.speed))
+    moved_b = rng.standard_normal((beams.ping.max() + 1, 3))
+    speed = np.einsum("mi,mi->m", beams.beam_b, moved_b[beams.ping]) + own + 0.1 * (beams.beam == 1)
+    beams = dataclasses.replace(beams, speed=speed)
+    assert np.std(parity_of(beams)) == pytest.approx(noise, rel=0.2)
+    said = DetectedFault("DVL", "errs", 0.0, 200.0, 1e4, 800, Treatment.WIDENED)
+    found = noisy_or_compared(said, beams)
+    assert found.sensor == sensor
+    of_three = beams.take(beams.beam < 3)
+    assert noisy_or_compared(said, of_three).sensor == "DVL"
 
 
 @pytest.mark.parametrize("n", [30, 60, 150])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -30,6 +31,8 @@ LEAST_FORCE = 10.0
 """m/s^2, of a jump: it is no larger."""
 MEDIAN_OF_THREE = 2.366
 """Of a chi-square with three degrees of freedom."""
+STEADY = 0.02
+"""Width of the nuisances of inertial data that is next to none."""
 WORTH = 15.0
 """Chi-square of a constant from which on a sensor may be off by anything."""
 
@@ -75,7 +78,7 @@ class Fault:
     rivals: tuple[Fault, ...] = ()
     """Others that explain the data as well"""
     onsets: tuple[Fault, ...] = ()
-    """The same ramp from other times on, at which it may have begun"""
+    """The same from other times on, or to others, at which it may have begun or ended"""
     sizes: Array | None = None
     """Of its numbers, taken off the rows already; None for what is new"""
     cost_m: float = 0.0
@@ -123,6 +126,12 @@ class Judge:
         prior, width = priors.information(self.widths), priors.width(self.widths)
         n_coarse = len(grid.coarse()[0])
         return unstated_of(self._nuisances, width, score, among, prior, n_coarse)
+
+    def with_steady_biases(self) -> Judge:
+        """Return the same with inertial data whose errors are as stated, and no more."""
+        judge = copy.copy(self)
+        judge.widths = (*self.widths[:-1], STEADY)
+        return judge
 
     def _of_nuisances(self, grid: Grid, faults: Sequence[Fault]) -> tuple[Priors, Array, Array]:
         """Return their priors, scores and information among themselves, once faults are freed."""

@@ -77,8 +77,13 @@ class PieceSearch:
             found.append((piece, own))
         return joined_of(found)
 
-    def unstated(self, judge: Judge, channels: Channels, known: Sequence[Fault]) -> Unstated | None:
-        """Return what the first piece says of what instruments do not state: it is so in all."""
+    def unstated(
+        self, judge: Judge, channels: Channels, known: Sequence[Fault]
+    ) -> tuple[Unstated | None, list[Fault]]:
+        """Return what the first piece says of what instruments do not state: it is so in all.
+
+        And jumps that may be instead of it.
+        """
         keyframe_s = judge.linear.problem.keyframe_s
         piece = pieces_of(keyframe_s, self._settings.piece_s)[0]
         look = Look(judge, channels, self._settings, (piece.begin, piece.end))
@@ -162,7 +167,11 @@ def joined(one: Fault, later: Fault, seam: int) -> Fault:
             first, second = (rival, same) if stronger is one else (same, rival)
             rival = joined(first, second, seam)
         rivals.append(rival)
-    onsets = tuple(replace(ramp, end=end) for ramp in stronger.onsets if ramp.begin < end)
+    onsets = tuple(
+        replace(other, end=end)
+        for other in stronger.onsets
+        if other.begin < end and other.end == stronger.end
+    )
     return replace(stronger, begin=begin, end=end, rivals=tuple(rivals), onsets=onsets)
 
 

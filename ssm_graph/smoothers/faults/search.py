@@ -8,7 +8,7 @@ first solution may be far off.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -92,9 +92,29 @@ class Look:
         self._work = 0.2 * (piece[1] - piece[0])
         self.hypotheses = hypotheses_of(channels, significance=settings.significance)
 
-    def unstated(self, known: Sequence[Fault]) -> Unstated | None:
-        """Return what instruments err in beyond what they state, beside what was found."""
-        return self._judge.unstated(self._grid(with_rivals(known)), with_rivals(known))
+    def unstated(self, known: Sequence[Fault]) -> tuple[Unstated | None, list[Fault]]:
+        """Return what instruments err in beyond what they state, beside what was found.
+
+        Where biases seem to wander, but one that has jumped explains all of it, that comes, too: a
+        vehicle at an even speed that turns by a little more looks like one that is pushed aside.
+        """
+        grid, others = self._grid(with_rivals(known)), with_rivals(known)
+        found = self._judge.unstated(grid, others)
+        if found is None or not found.has_wandering_biases:
+            return found, []
+        left = self._judge.with_steady_biases().on(grid).with_freed(others)
+        inertial = [one for one in self.hypotheses if one.channel == IMU]
+        jumps = [fault_of(one, left) for one in left.best_of(inertial) if one.is_significant]
+        if not jumps or jumps[0].merit <= 0.0:
+            return found, []
+        rest = self._judge.unstated(self._grid([*others, jumps[0]]), [*others, jumps[0]])
+        if rest is not None and rest.has_wandering_biases:
+            return found, []
+        best, *rivals = [
+            as_large_as_alone(replace(jumps[0], hypothesis=one), left, [])
+            for one in sorted(inertial, key=lambda one: one is not jumps[0].hypothesis)
+        ]
+        return found, [replace(best, rivals=tuple(rivals))]
 
     def find_steps(self, known: Sequence[Fault]) -> Steps[list[Fault]]:
         """Return what is off: what was before, as it competes now, and what is new."""
@@ -253,13 +273,18 @@ def fault_of(candidate: Candidate, judged: Judged) -> Fault:
 def chosen_of(ranked: Sequence[Candidate]) -> Candidate | None:
     """Return what is to be freed, None if nothing is significant; inertial data come last.
 
-    Biases over stretches explain a part of anything.
+    Biases over stretches explain a part of anything. But what even readings that may be anything
+    explain less well is their fault.
     """
     significant = [one for one in ranked if one.is_significant]
     if not significant:
         return None
     best = significant[0]
-    others = (one for one in significant if one.hypothesis.channel != IMU)
+    others = (
+        one
+        for one in significant
+        if one.hypothesis.channel != IMU and one.hypothesis.course is not Course.ANYTHING
+    )
     other = next(others, best)
     return other if other.merit > INERTIAL_SHARE * best.merit else best
 
@@ -282,8 +307,12 @@ def rivals_of(
 def onsets_of(ramp: Fault, judged: Judged) -> tuple[Fault, ...]:
     """Return a ramp with the first, the likeliest and the last onset that explain the data.
 
-    Only those a block or more away from others count; of what is no ramp there are none.
+    Only those a block or more away from others count. Of a bias of the inertial data, which begins
+    and ends between keyframes, both intervals beside each of its ends have sizes of their own. Of
+    what is neither there are none.
     """
+    if ramp.hypothesis.channel == IMU:
+        return tuple(_beside_edges(ramp, judged))
     if ramp.hypothesis.course is not Course.RAMP:
         return ()
     grid = judged.grid
@@ -295,6 +324,17 @@ def onsets_of(ramp: Fault, judged: Judged) -> tuple[Fault, ...]:
         if np.min(np.abs(edge_s[known] - edge_s[at])) >= grid.block_s:
             known.append(int(at))
     return tuple(replace(ramp, begin=int(grid.edges[at])) for at in known[1:])
+
+
+def _beside_edges(bias: Fault, judged: Judged) -> Iterator[Fault]:
+    """Yield a bias that begins, or ends, a keyframe before or after, as large as it is at most."""
+    first, last = judged.grid.edges[[0, -1]].tolist()
+    sized = as_large_as_alone(bias, judged, [])
+    for shift in (-1, 1):
+        for one in (replace(sized, begin=bias.begin + shift), replace(sized, end=bias.end + shift)):
+            is_inside = first < bias.begin if one.end == bias.end else bias.end < last
+            if is_inside and first <= one.begin < one.end <= last:
+                yield one
 
 
 def as_large_as_alone(fault: Fault, judged: Judged, others: Sequence[Fault]) -> Fault:

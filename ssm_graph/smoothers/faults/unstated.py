@@ -76,6 +76,11 @@ class Unstated:
     chi_sq: dict[str, tuple[float, float]]
     """What it is and is where nothing is unstated, of each that is more, by name"""
 
+    @property
+    def has_wandering_biases(self) -> bool:
+        """Whether biases of the inertial data are among it."""
+        return any(slow.name in BIASES for slow in self.slow)
+
     def inflation_of(self, name: str) -> float:
         """Return by how much larger the variance of readings is than white noise says."""
         return next((slow.inflation for slow in self.slow if slow.name == name), 1.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,10 @@ from ssm_graph.smoothers.faults.windows import noisier_than_stated
 
 MOST_LOOKS = 8
 """Looks after which the search ends whatever it finds."""
+SLOW: Final = 0.7
+"""Of the update before, from which on a pass hardly comes nearer, and"""
+SLOW_PASSES: Final = 3
+"""how many such passes in a row are waited for."""
 
 
 class Changed(NamedTuple):
@@ -70,13 +74,16 @@ class FaultWatch:
         """what it found, if the search ended without settling"""
         self._unstated: Unstated | None = None
         """What instruments were found to err in beyond what they state"""
+        self._undecided: list[Fault] = []
+        """The last of what was found: what may be instead of that, which is judged no more"""
         self._contradicted: list[DetectedFault] = []
         """What the inertial data contradicted before that was allowed for"""
-        self._is_statement_judged = False
+        self._is_statement_judged = self._is_let_back = False
         self._beams_out = np.zeros(len(problem.beams.speed), bool)
         self.aids_out = np.zeros(sum(len(aid) for aid in aids_of(problem)), bool)
         """(A,) measurements of aids that may have read anything"""
         self._n_looks, self._is_done = 0, search is None
+        self._last_update, self._n_slow = np.inf, 0
 
     def leave_out(self, weights: Array) -> Array:
         """Return the weights (M,) with the floor for beams that may have read anything."""
@@ -96,7 +103,7 @@ class FaultWatch:
         """
         if self._is_done or self._bare is None or self._search is None:
             return None
-        if update_sigmas >= NEAR_SIGMAS:
+        if update_sigmas >= NEAR_SIGMAS and not self._is_slow(update_sigmas):
             return None
         self._n_looks += 1
         own = states.constants[: self._problem.extras.n_constants]
@@ -109,11 +116,18 @@ class FaultWatch:
         channels = Channels(linear)
         judge = Judge(linear, channels, Nuisances(linear, channels))
         yield 0.02 * self._problem.n_keyframes
-        found = yield from self._search.find_steps(judge, channels, self._sized(states))
+        known = self._sized(states)[: len(self._found) - len(self._undecided)]
+        found = yield from self._search.find_steps(judge, channels, known)
+        found.extend(self._undecided)
         is_same = same_faults(found, self._found, self._problem.keyframe_s)
+        if is_same and not self._is_let_back:
+            self._is_let_back = True
+            found = let_back(found)
+            is_same = len(found) == len(self._found)
         if is_same and not self._is_statement_judged:
             self._is_statement_judged = True
-            self._unstated = self._search.unstated(judge, channels, self._sized(states))
+            self._unstated, self._undecided = self._search.unstated(judge, channels, known)
+            found.extend(self._undecided)
             if self._unstated is not None:
                 is_same = False
                 fit = inertial_fit(linear.inertial_rows(), linear.solution)
@@ -127,7 +141,9 @@ class FaultWatch:
         if self._is_done:
             self._gone = beside(self._found, found, self._problem.keyframe_s)
             self._new = beside(found, self._found, self._problem.keyframe_s)
-        self._found = sorted(found, key=lambda fault: (fault.begin, fault.end))
+        n_decided = len(found) - len(self._undecided)
+        decided = sorted(found[:n_decided], key=lambda fault: (fault.begin, fault.end))
+        self._found = [*decided, *self._undecided]
         self._leave_out(channels)
         freed, problem = self._freed(channels), self._problem
         if len(freed.sigma):
@@ -140,6 +156,16 @@ class FaultWatch:
             self.leave_out(linear.beam_weights),
             self.leave_aids_out(np.concatenate([np.zeros(0), *linear.aid_weights.values()])),
         )
+
+    def _is_slow(self, update_sigmas: float) -> bool:
+        """Return whether passes come no nearer: what is off bends the answer beyond their reach."""
+        is_slower = update_sigmas > SLOW * self._last_update
+        self._n_slow = self._n_slow + 1 if is_slower else 0
+        self._last_update = update_sigmas
+        if self._n_slow < SLOW_PASSES:
+            return False
+        self._n_slow = 0
+        return True
 
     def inflation_of(self, name: str) -> float:
         """Return by how much readings of the DVL, or of an aid, say less than white noise would."""
@@ -251,6 +277,15 @@ class FaultWatch:
         return (*found, *(left or before))
 
 
+def let_back(found: list[Fault]) -> list[Fault]:
+    """Return what was found without what may have read anything, unless that is all.
+
+    Rows that count for nothing say no more, and they were left out before the others were found.
+    """
+    others = [fault for fault in found if fault.hypothesis.course is not Course.ANYTHING]
+    return others or found
+
+
 def late_of(fault: Fault) -> float | None:
     """Return the delay of a clock, s, None of what is none."""
     is_clock = fault.hypothesis.channel.endswith(CLOCK) and fault.sizes is not None
@@ -263,9 +298,9 @@ def said(fault: Fault) -> str:
     if sizes is None:
         return "reads what nothing else agrees with"
     d, minute = hypothesis.combined.shape[1], 60.0 / TREND_S
+    sizes = sum((other.sizes for other in fault.onsets if other.sizes is not None), sizes)
     if hypothesis.course is Course.RAMP:
-        last = sum((ramp.sizes for ramp in fault.onsets if ramp.sizes is not None), sizes)
-        return f"from nothing on, and within each minute by {hypothesis.say(minute * last)}"
+        return f"from nothing on, and within each minute by {hypothesis.say(minute * sizes)}"
     text = hypothesis.say(sizes[:d])
     if hypothesis.course is Course.TREND:
         text += f", and within a minute more by {hypothesis.say(minute * sizes[d:])}"

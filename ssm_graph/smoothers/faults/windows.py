@@ -24,6 +24,8 @@ from ssm_graph.graph.aids.depth import DepthMeans
 from ssm_graph.graph.inertial_rows import InertialFit
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.mission.fault import DetectedFault, Treatment
+from ssm_graph.mission.problem import Beams
+from ssm_graph.smoothers.faults.columns import BESIDE_MEDIAN, beside_median
 from ssm_graph.smoothers.faults.nuisances import DVL, SLOW_AID, SLOW_AIDS, SLOW_BEAM
 from ssm_graph.smoothers.verdict import efficiency
 
@@ -54,6 +56,8 @@ FEWEST: Final = 30
 """the fewest that do, and that a stretch has which is said to last,"""
 NOTABLE_SQUARE: Final = 2.0
 """and their variance by that stated, from which on they are noisier if that is no chance."""
+SEEN_BY_THREE: Final = 3
+"""Beams: any speeds of so many are those of some velocity."""
 LEAST_SHARE: Final = 1e-3
 """What a measurement says is never less than this share of its weight: sigmas 30 times as large."""
 
@@ -239,6 +243,36 @@ def informative(
         most[own] = most_by_noise(t[own], weights[own], time_s[own], dim=dim)
     says = np.minimum(efficiency(t, weights, kernel, dim=dim), most)
     return says, _noisy(sensor, t, np.where(freed, np.inf, most), time_s, dim=dim)
+
+
+def noisy_or_compared(noisy: DetectedFault, beams: Beams) -> DetectedFault:
+    """Return the finding of a noisy DVL, or of what it is compared with, if its beams agree.
+
+    What no velocity makes of more than three beams is their noise alone, whatever the vehicle does.
+    """
+    parity = beside_median(parity_of(beams)) / np.sqrt(BESIDE_MEDIAN)
+    square = float(np.median(parity**2)) / float(chi2.isf(0.5, 1)) if len(parity) else np.inf
+    if len(parity) < FEWEST or square > NOTABLE_SQUARE:
+        return noisy
+    return replace(
+        noisy,
+        sensor="IMU",
+        what=f"misses beams of the DVL, which agree to {np.sqrt(square):.1f} of their sigmas",
+        remedy="look at noise, stamps and filters of [imu]",
+    )
+
+
+def parity_of(beams: Beams) -> Array:
+    """Return what no velocity makes of the speeds of whole pings (P, B - 3), in sigmas."""
+    count = np.bincount(beams.ping)
+    own = (count[beams.ping] == beams.n_beams) & (beams.n_beams > SEEN_BY_THREE)
+    shape = -1, beams.n_beams
+    if not own.any():
+        return np.zeros(0)
+    speed, sigma = beams.speed[own].reshape(shape), beams.sigma[own].reshape(shape)
+    whitened = beams.beam_b[own].reshape(*shape, 3) / sigma[..., None]
+    null = np.linalg.svd(whitened)[0][..., SEEN_BY_THREE:]
+    return np.asarray(np.einsum("pbi,pb->pi", null, speed / sigma))
 
 
 def _noisy(sensor: str, t: Array, most: Array, time_s: Array, *, dim: int) -> DetectedFault | None:
