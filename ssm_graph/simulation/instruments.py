@@ -72,9 +72,8 @@ class InertialErrors(checked.Settings):
     :data:`GROUP_DELAY` over this."""
     late_s: float = checked.not_negative(0.0, hint="try 0.002 s")
     """Samples are stamped later than they are by this much, s, filter not counted."""
-    late_tolerance: float = checked.not_negative(0.05, hint="write 5 % as 0.05")
-    """Sigma of the very unit's ``late_s`` by that of its data sheet, drawn once a mission: the
-    oscillators of such units are good to some per cent."""
+    late_tolerance: float = checked.not_negative(0.0, hint="write 5 % as 0.05")
+    """Sigma of the very unit's ``late_s`` by that of its data sheet, drawn once a mission."""
     gyro_range: float | None = checked.positive(None, hint="500 deg/s is 8.7")
     """Readings end here, rad/s; None for nowhere."""
     accel_range: float | None = checked.positive(None, hint="4 g is 39")
@@ -177,6 +176,7 @@ def _inertial(sheet: tuple[float, ...], **others: float | bool) -> InertialError
         accel_instability=a_floor * MICRO_G,
         gyro_vibration=2e-4,
         accel_vibration=0.02,
+        late_tolerance=0.05,  # oscillators and drivers of such units keep some per cent
         **others,  # type: ignore[arg-type]
     )
 

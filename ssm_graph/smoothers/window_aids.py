@@ -175,8 +175,10 @@ class WindowAids:
                 here = row_states(self._sensors, at.take(k[:n_first]))
                 first = aid.take(np.s_[:n_first]).led_along(None, here)
                 led = first.followed_by(led) if n_first < len(k) else first
-            anew = _Measured(led, *led.whitened(own), *some[3:])
-            self._all[name] = one.replaced(rows, anew)
+            error, jacobian = led.whitened(own)
+            self._all[name] = one.replaced(
+                rows, some._replace(aid=led, error=error, jacobian=jacobian)
+            )
 
     def drop(self, count: int) -> None:
         """Forget the first keyframes."""

@@ -210,7 +210,7 @@ def test_a_known_delay_is_taken_off_the_stamps(tmp_path: Path) -> None:
     """Late by a sample and a half and said to be so: the answers are those of stamps on time."""
     mission = turning(duration_s=10.0, imu_rate_hz=100.0).mission
     imu, late = mission.imu, ImuCalibration(time_offset_s=LATE_S)
-    stamps = {"start_s": imu.start_s + LATE_S, "time_s": imu.time_s + LATE_S}
+    stamps: dict[str, Any] = {"start_s": imu.start_s + LATE_S, "time_s": imu.time_s + LATE_S}
     write_mission(tmp_path, replace(mission, imu=replace(imu, calibration=late, **stamps)))
     off = read_mission(tmp_path)
     assert off.imu.calibration.time_offset_s == LATE_S

@@ -27,6 +27,7 @@ from ssm_graph.mission.suspects.regression import robust_residual, walk_covarian
 from ssm_graph.mission.suspects.search import vertex
 from ssm_graph.sensors.compass import HeadingLog
 from ssm_graph.sensors.dvl import beams_from_angles, rpy_from_R_bd
+from ssm_graph.sensors.imu_calibration import ImuCalibration
 from ssm_graph.simulation.aids import AidSettings, CompassSettings, GnssSettings
 from ssm_graph.simulation.beam_faults import OutlierKind, Outliers
 from ssm_graph.simulation.config import SimulationConfig
@@ -213,9 +214,12 @@ def test_late_depths_and_early_inertial_data() -> None:
     assert found.sensor == "depth"
     assert float(found.remedy.split()[1]) == pytest.approx(late_s, abs=0.1)
     imu, late_s = mission.imu, -0.5
-    found = only(with_imu(mission, time_s=imu.time_s + late_s, start_s=imu.start_s + late_s))
+    early = with_imu(mission, time_s=imu.time_s + late_s, start_s=imu.start_s + late_s)
+    found = only(early)
     assert found.sensor == "IMU"
-    assert float(found.remedy.split()[1]) == pytest.approx(late_s, abs=0.02)
+    assert found.remedy.startswith("[imu] time_offset_s = ")
+    assert number(found.remedy) == pytest.approx(late_s, abs=0.02)
+    assert not find_suspects(with_imu(early, calibration=ImuCalibration(time_offset_s=late_s)))
 
 
 def test_a_late_compass() -> None:
@@ -244,11 +248,15 @@ def test_gyros_of_another_scale(grade: Grade, scale: float, says: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_calibration_takes_care_of_the_gyros() -> None:
-    """A factor within four of the prior sigmas that the mission states for it."""
+@pytest.mark.parametrize(
+    "known",
+    [ImuCalibration(gyro_scale_sigma=0.5), ImuCalibration(gyro_scale_error=np.full(3, -0.4))],
+    ids=["asked for", "stated"],
+)
+def test_a_calibration_takes_care_of_the_gyros(known: ImuCalibration) -> None:
+    """A factor within four of the prior sigmas that the mission states for it, or that it knows."""
     mission = healthy("survey", Grade.MEMS, 51)
-    asks = replace(mission.imu.calibration, gyro_scale_sigma=0.5)
-    assert not find_suspects(with_imu(mission, gyro_b=0.6 * mission.imu.gyro_b, calibration=asks))
+    assert not find_suspects(with_imu(mission, gyro_b=0.6 * mission.imu.gyro_b, calibration=known))
 
 
 def test_a_gyro_of_the_other_sign() -> None:

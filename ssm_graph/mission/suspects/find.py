@@ -59,12 +59,13 @@ def find_suspects(mission: Mission) -> tuple[DetectedFault, ...]:
     Nothing is said of a mission whose logs are short or say little: a straight run has no turn to
     compare. The rate of false alarms is in ``docs/method-details.md``.
     """
-    plain = tuple(of_gravity(mission))
-    if plain or not is_enough(mission):
+    logs = replace(mission, imu=mission.imu.calibrated)
+    plain = tuple(of_gravity(logs))
+    if plain or not is_enough(logs):
         return plain
-    by_parity = order_by_parity(mission)
+    by_parity = order_by_parity(logs)
     order = None if by_parity is None else by_parity[0]
-    found = search(mission if order is None else reordered(mission, order))
+    found = search(logs if order is None else reordered(logs, order))
     faults = [said(one, mission, order) for one in found]
     if (
         by_parity is not None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from itertools import permutations, product
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.suspects.families import AXES, DEPTH_UNITS, UNITS
 from ssm_graph.mission.suspects.search import Found
 from ssm_graph.sensors.dvl import DvlMount, rpy_from_R_bd
+from ssm_graph.sensors.imu_calibration import MOST_LATE_S
 
 SAYS: Final = 10.0
 """Gain of a part that is named as evidence."""
@@ -40,8 +41,6 @@ SENSORS: Final = {
 }
 """By family; all others are gyros."""
 SECTIONS: Final = {"depth": "[depth]", "compass": "[heading]", "IMU": "[imu]", "GNSS": "[gnss]"}
-OFFSETS: Final = ("DVL", "GNSS")
-"""Whose sections have a ``time_offset_s``."""
 
 
 def sensor_of(found: Found) -> str:
@@ -123,12 +122,13 @@ def _of_clock(found: Found, mission: Mission) -> tuple[str, str]:
         late_s = sign * found.value
         leap_s, why = _leap(late_s, found.sigma)
         what = f"{_late(late_s)} (sigma {found.sigma:.1g} s){why}"
-        if sensor not in OFFSETS:
+        stated: dict[str, Any] = {"DVL": mission.dvl.mount, "IMU": mission.imu.calibration}
+        if mission.gnss is not None:
+            stated["GNSS"] = mission.gnss.calibration
+        total_s = leap_s + stated[sensor].time_offset_s if sensor in stated else 0.0
+        if sensor not in stated or (sensor == "IMU" and abs(total_s) > MOST_LATE_S):
             return what, f"take {leap_s:.2f} s off time_s in the table of {section}"
-        stated = mission.dvl.mount.time_offset_s
-        if sensor == "GNSS" and mission.gnss is not None:
-            stated = mission.gnss.calibration.time_offset_s
-        return what, f"{section} time_offset_s = {stated + leap_s:.2f}"
+        return what, f"{section} time_offset_s = {total_s:.2f}"
     is_before = abs(delay.before_s) > abs(delay.after_s)
     late_s = sign * (delay.before_s if is_before else delay.after_s)
     leap_s, why = _leap(late_s, found.sigma)
