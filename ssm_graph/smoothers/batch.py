@@ -215,6 +215,9 @@ class SsmSmoother:
             weights = weights.after(this, faults)
         left: list[DetectedFault] = []
         if self.config.fault_search is not None:
+            linearizer, states = faults.allowing(linearizer, this.states)
+            if states is not this.states:
+                this = this._replace(states=states, beam_rows=linearizer.beam_rows(states))
             this, left = yield from self._with_sigmas_steps(linearizer, this, weights, faults)
         inertial = inertial_fit(linearizer.inertial_rows(this.states), this.step)
         yield 0.02 * problem.n_keyframes
@@ -250,7 +253,10 @@ class SsmSmoother:
             linearizer, last.states, last.beam_rows.error, last.weights, last.aid_weights
         )
         left = [one for one in found if one is not None]
-        return last._replace(step=step), [*left, *disagreeing(readings, keyframe_s)]
+        return last._replace(step=faults.covering(step)), [
+            *left,
+            *disagreeing(readings, keyframe_s),
+        ]
 
     def _iterate(
         self,

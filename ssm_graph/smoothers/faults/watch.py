@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from factors.similarity import WEIGHT_FLOOR
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps
+from ssm_graph.engine.chain import ChainSolution
 from ssm_graph.engine.extras import Extras
 from ssm_graph.engine.reweighting import NEAR_SIGMAS
 from ssm_graph.engine.states import States
-from ssm_graph.graph.freed import Freed
+from ssm_graph.graph.freed import FAULTS, Freed
 from ssm_graph.graph.inertial_rows import InertialFit, inertial_fit
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.measurements import aids_of
@@ -76,6 +77,10 @@ class FaultWatch:
         """What instruments were found to err in beyond what they state"""
         self._undecided: list[Fault] = []
         """The last of what was found: what may be instead of that, which is judged no more"""
+        self._possible: list[Fault] = []
+        """What may be chance: nothing is taken off, the sigmas allow for it"""
+        self._on_possible = np.zeros((problem.n_keyframes - 1, 15, 0))
+        """(K - 1, 15, P) what it does to the whitened inertial rows"""
         self._contradicted: list[DetectedFault] = []
         """What the inertial data contradicted before that was allowed for"""
         self._is_statement_judged = self._is_let_back = False
@@ -126,8 +131,16 @@ class FaultWatch:
             is_same = len(found) == len(self._found)
         if is_same and not self._is_statement_judged:
             self._is_statement_judged = True
-            self._unstated, self._undecided = self._search.unstated(judge, channels, known)
+            beside_all = self._search.beside(judge, channels, known)
+            self._unstated, self._undecided, self._possible = beside_all
+            self._on_possible = _columns(
+                self._possible,
+                {IMU: channels.between},
+                np.arange(len(channels.between)),
+                self._problem.keyframe_s,
+            )
             found.extend(self._undecided)
+            is_same = not self._undecided
             if self._unstated is not None:
                 is_same = False
                 fit = inertial_fit(linear.inertial_rows(), linear.solution)
@@ -166,6 +179,30 @@ class FaultWatch:
             return False
         self._n_slow = 0
         return True
+
+    def allowing(
+        self, linearizer: GraphLinearizer, states: States
+    ) -> tuple[GraphLinearizer, States]:
+        """Return a linearizer and states with what may be chance as further constants, of zero."""
+        if not self._possible:
+            return linearizer, states
+        sigma = np.concatenate([one.hypothesis.sigma for one in self._possible])
+        freed = linearizer.freed or Freed.nothing(self._problem)
+        wide = freed.with_between(sigma, self._on_possible)
+        extras = linearizer.problem.extras.without({FAULTS})
+        problem = replace(linearizer.problem, extras=Extras((*extras.blocks, wide.variable)))
+        constants = np.concatenate([states.constants, np.zeros(len(sigma))])
+        return GraphLinearizer(problem, wide), states._replace(constants=constants)
+
+    def covering(self, step: ChainSolution) -> ChainSolution:
+        """Return a solution of :meth:`allowing` whose sigmas are those of an answer without it.
+
+        They hold if it is as large as it seems, and nobody took it off.
+        """
+        covariance, n = step.constants_cov.copy(), len(self._possible)
+        at = np.arange(len(covariance) - n, len(covariance))
+        covariance[at, at] += [float(np.sum(one.sizes**2)) for one in self._possible]
+        return step._replace(constants_cov=covariance)
 
     def inflation_of(self, name: str) -> float:
         """Return by how much readings of the DVL, or of an aid, say less than white noise would."""
@@ -266,9 +303,21 @@ class FaultWatch:
                 )
             )
         if self._unstated is not None:
-            n = len(states.constants) - len(self._unstated.errors_sigma)
-            span_s = float(end_s[0]), float(end_s[-1])
-            found.extend(self._unstated.faults(states.constants[n:], *span_s))
+            end = len(states.constants) - len(self._possible)
+            errors = states.constants[end - len(self._unstated.errors_sigma) : end]
+            found.extend(self._unstated.faults(errors, float(end_s[0]), float(end_s[-1])))
+        found.extend(
+            DetectedFault(
+                sensor=one.hypothesis.sensor,
+                what=f"may be {said(one)}",
+                begin_s=float(end_s[one.begin]),
+                end_s=float(end_s[one.end]),
+                chi_sq=one.chi_sq,
+                dof=one.n_constants,
+                treatment=Treatment.ALLOWED,
+            )
+            for one in self._possible
+        )
         left = noisier_than_stated(inertial, self._problem.keyframe_s)
         lines = [one.remedy for one in found if one.treatment is Treatment.WIDENED]
         before = [
