@@ -38,9 +38,10 @@ from ssm_graph.smoothers.faults.hypotheses import Course
 from ssm_graph.smoothers.faults.judged import Fault, Judge
 from ssm_graph.smoothers.faults.nuisances import Nuisances
 from ssm_graph.smoothers.faults.pieces import PieceSearch
-from ssm_graph.smoothers.faults.search import FaultSearch, with_rivals
+from ssm_graph.smoothers.faults.search import Beside, FaultSearch, with_rivals
 from ssm_graph.smoothers.faults.unstated import WIDER, Unstated
 from ssm_graph.smoothers.faults.windows import noisier_than_stated
+from ssm_graph.smoothers.unwound import unwound_steps
 
 MOST_LOOKS = 8
 """Looks after which the search ends whatever it finds."""
@@ -83,7 +84,7 @@ class FaultWatch:
         """(K - 1, 15, P) what it does to the whitened inertial rows"""
         self._contradicted: list[DetectedFault] = []
         """What the inertial data contradicted before that was allowed for"""
-        self._is_statement_judged = self._is_let_back = False
+        self._is_statement_judged = self._is_let_back = self._is_unwound = False
         self._beams_out = np.zeros(len(problem.beams.speed), bool)
         self.aids_out = np.zeros(sum(len(aid) for aid in aids_of(problem)), bool)
         """(A,) measurements of aids that may have read anything"""
@@ -99,17 +100,34 @@ class FaultWatch:
         return np.where(self.aids_out, WEIGHT_FLOOR, weights)
 
     def look_steps(
-        self, linearizer: GraphLinearizer, states: States, *, update_sigmas: float
+        self,
+        linearizer: GraphLinearizer,
+        states: States,
+        weights: Array,
+        aid_weights: Array,
+        *,
+        update_sigmas: float,
     ) -> Steps[Changed | None]:
-        """Search once the solution is near; return what has changed, None for nothing.
+        """Look once the solution is near; return what has changed, None for nothing.
 
-        What is found is freed; then it is searched again at what the solution has become, until
-        nothing changes any more. ``linearizer`` is that of the pass.
+        First for circles that nobody saw. Then what is found by a search is freed, and it is
+        searched again at what the solution has become, until nothing changes any more.
+        ``linearizer`` is that of the pass, the weights (M,) and (A,) are those that it led to.
         """
-        if self._is_done or self._bare is None or self._search is None:
+        is_near = update_sigmas < NEAR_SIGMAS
+        if is_near and not self._is_unwound:
+            self._is_unwound, wound = True, states
+            states = yield from unwound_steps(linearizer, states, weights, aid_weights)
+            if states is not wound:
+                return Changed(linearizer, states, weights, aid_weights)
+        if self._is_done or not (is_near or self._is_slow(update_sigmas)):
             return None
-        if update_sigmas >= NEAR_SIGMAS and not self._is_slow(update_sigmas):
-            return None
+        return (yield from self._search_steps(linearizer, states))
+
+    def _search_steps(self, linearizer: GraphLinearizer, states: States) -> Steps[Changed | None]:
+        """Search at the states, and free what is found."""
+        assert self._bare is not None
+        assert self._search is not None
         self._n_looks += 1
         own = states.constants[: self._problem.extras.n_constants]
         bare_states = states._replace(constants=own)
@@ -123,31 +141,14 @@ class FaultWatch:
         yield 0.02 * self._problem.n_keyframes
         known = self._sized(states)[: len(self._found) - len(self._undecided)]
         found = yield from self._search.find_steps(judge, channels, known)
-        found.extend(self._undecided)
-        is_same = same_faults(found, self._found, self._problem.keyframe_s)
+        is_same = same_faults([*found, *self._undecided], self._found, self._problem.keyframe_s)
         if is_same and not self._is_let_back:
-            self._is_let_back = True
+            self._is_let_back, n_found = True, len(found)
             found = let_back(found)
-            is_same = len(found) == len(self._found)
+            is_same = len(found) == n_found
         if is_same and not self._is_statement_judged:
-            self._is_statement_judged = True
-            beside_all = self._search.beside(judge, channels, known)
-            self._unstated, self._undecided, self._possible = beside_all
-            self._on_possible = _columns(
-                self._possible,
-                {IMU: channels.between},
-                np.arange(len(channels.between)),
-                self._problem.keyframe_s,
-            )
-            found.extend(self._undecided)
-            is_same = not self._undecided
-            if self._unstated is not None:
-                is_same = False
-                fit = inertial_fit(linear.inertial_rows(), linear.solution)
-                self._contradicted = noisier_than_stated(fit, self._problem.keyframe_s)
-                chain = self._unstated.widened(self._problem.chain)
-                self._problem = replace(self._problem, chain=chain)
-                self._bare = GraphLinearizer(self._problem)
+            is_same = self._judge_statement(self._search.beside(judge, channels, known), judge)
+        found.extend(self._undecided)
         self._is_done = is_same or self._n_looks >= MOST_LOOKS
         if is_same:
             return None
@@ -170,6 +171,21 @@ class FaultWatch:
             self.leave_aids_out(np.concatenate([np.zeros(0), *linear.aid_weights.values()])),
         )
 
+    def _judge_statement(self, found: Beside, judge: Judge) -> bool:
+        """Keep what there may be beside the faults; return whether the answer stays as it is."""
+        self._is_statement_judged = True
+        self._unstated, self._undecided, self._possible = found
+        between, time_s = judge.channels.between, self._problem.keyframe_s
+        of_imu = {IMU: between}
+        self._on_possible = _columns(self._possible, of_imu, np.arange(len(between)), time_s)
+        if self._unstated is None:
+            return not self._undecided
+        fit = inertial_fit(judge.linear.inertial_rows(), judge.linear.solution)
+        self._contradicted = noisier_than_stated(fit, time_s)
+        self._problem = replace(self._problem, chain=self._unstated.widened(self._problem.chain))
+        self._bare = GraphLinearizer(self._problem)
+        return False
+
     def _is_slow(self, update_sigmas: float) -> bool:
         """Return whether passes come no nearer: what is off bends the answer beyond their reach."""
         is_slower = update_sigmas > SLOW * self._last_update
@@ -180,9 +196,9 @@ class FaultWatch:
         self._n_slow = 0
         return True
 
-    def allowing(
+    def allowing_steps(
         self, linearizer: GraphLinearizer, states: States
-    ) -> tuple[GraphLinearizer, States]:
+    ) -> Steps[tuple[GraphLinearizer, States]]:
         """Return a linearizer and states with what may be chance as further constants, of zero."""
         if not self._possible:
             return linearizer, states
@@ -192,7 +208,10 @@ class FaultWatch:
         extras = linearizer.problem.extras.without({FAULTS})
         problem = replace(linearizer.problem, extras=Extras((*extras.blocks, wide.variable)))
         constants = np.concatenate([states.constants, np.zeros(len(sigma))])
-        return GraphLinearizer(problem, wide), states._replace(constants=constants)
+        linearizer, states = GraphLinearizer(problem, wide), states._replace(constants=constants)
+        yield from linearizer.integrate_steps(states)
+        linearizer.follow(states)
+        return linearizer, states
 
     def covering(self, step: ChainSolution) -> ChainSolution:
         """Return a solution of :meth:`allowing` whose sigmas are those of an answer without it.
