@@ -192,13 +192,8 @@ class SsmSmoother:
             is_settled = is_settled and weights.may_end(this)
             changed = None
             if number + 1 < self.config.max_iterations:
-                changed = yield from faults.look_steps(
-                    linearizer,
-                    states,
-                    this.weights,
-                    this.aid_weights,
-                    update_sigmas=this.update_sigmas,
-                )
+                to, size = (this.weights, this.aid_weights), this.update_sigmas
+                changed = yield from faults.look_steps(linearizer, states, *to, update_sigmas=size)
             if changed is not None:
                 linearizer, states = changed.linearizer, changed.states
                 rows, anew = linearizer.beam_rows(states), self.config.schedule()
@@ -211,9 +206,9 @@ class SsmSmoother:
             weights = weights.after(this, faults)
         left: list[DetectedFault] = []
         if self.config.fault_search is not None:
-            linearizer, states = yield from faults.allowing_steps(linearizer, this.states)
-            this = this._replace(states=states, beam_rows=linearizer.beam_rows(states))
-            this, left = yield from self._with_sigmas_steps(linearizer, this, weights, faults)
+            linearizer, this, left = yield from self._with_sigmas_steps(
+                linearizer, this, weights, faults
+            )
         inertial = inertial_fit(linearizer.inertial_rows(this.states), this.step)
         yield 0.02 * problem.n_keyframes
         freed = faults.faults(this.states, inertial)
@@ -225,8 +220,13 @@ class SsmSmoother:
 
     def _with_sigmas_steps(
         self, linearizer: GraphLinearizer, last: Pass, used: Weights, faults: FaultWatch
-    ) -> Steps[tuple[Pass, list[DetectedFault]]]:
-        """Return the last pass with the covariance that residuals ask for, and who errs more."""
+    ) -> Steps[tuple[GraphLinearizer, Pass, list[DetectedFault]]]:
+        """Return the last pass with the covariance that residuals ask for, and who errs more.
+
+        Its linearizer has what may be chance besides.
+        """
+        linearizer, states = yield from faults.allowing_steps(linearizer, last.states)
+        last = last._replace(states=states, beam_rows=linearizer.beam_rows(states))
         problem, aids, known = linearizer.problem, linearizer.weighted, np.ones(len(used.aids))
         t, weights, keyframe_s = last.mahalanobis_sq, last.weights, problem.keyframe_s
         beams_s = keyframe_s[problem.beams.keyframe]
@@ -247,11 +247,8 @@ class SsmSmoother:
         readings = readings_of(
             linearizer, last.states, last.beam_rows.error, last.weights, last.aid_weights
         )
-        left = [one for one in found if one is not None]
-        return last._replace(step=faults.covering(step)), [
-            *left,
-            *disagreeing(readings, keyframe_s),
-        ]
+        left = [one for one in found if one is not None] + disagreeing(readings, keyframe_s)
+        return linearizer, last._replace(step=faults.covering(step)), left
 
     def _iterate(
         self,
