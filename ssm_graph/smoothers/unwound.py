@@ -59,7 +59,8 @@ def shorter(states: States, unseen: Sequence[Unseen], keyframe_s: Array) -> Stat
     The body's velocities stay as they are, and what follows goes on from where that leads.
     """
     turns = so3.log(states.R_nb[:-1].mT @ states.R_nb[1:])
-    for begin, end in runs_of([bool(one.gap_s and one.rate[2]) for one in unseen]):
+    is_unseen = np.array([bool(one.gap_s and one.rate[2]) for one in unseen], bool)
+    for begin, end in runs_of(is_unseen):
         if abs(float(turns[begin:end, 2].sum())) <= np.pi:
             continue
         R_begin = states.R_nb[begin]

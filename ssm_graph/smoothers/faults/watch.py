@@ -218,9 +218,12 @@ class FaultWatch:
 
         They hold if it is as large as it seems, and nobody took it off.
         """
-        covariance, n = step.constants_cov.copy(), len(self._possible)
-        at = np.arange(len(covariance) - n, len(covariance))
-        covariance[at, at] += [float(np.sum(one.sizes**2)) for one in self._possible]
+        sizes = np.concatenate(
+            [np.zeros(0), *(s.sizes for s in self._possible if s.sizes is not None)]
+        )
+        covariance = step.constants_cov.copy()
+        at = np.arange(len(covariance) - len(sizes), len(covariance))
+        covariance[at, at] += sizes**2
         return step._replace(constants_cov=covariance)
 
     def inflation_of(self, name: str) -> float:
@@ -248,7 +251,7 @@ class FaultWatch:
         beams, time_s = self._problem.beams, self._problem.keyframe_s
         on_array = {
             name: channels.beams[:, channels.of(name).columns]
-            for name in (BEAM, BOTTOM, SCALE, MOUNTING)
+            for name in (BEAM, BOTTOM, SCALE, MOUNTING, IMU)
         }
         on_imu = {IMU: channels.between}
         keyframes = np.arange(len(channels.between))
