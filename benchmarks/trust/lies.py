@@ -233,6 +233,14 @@ def gyro_jumps(rng: Rng, end_s: float) -> Fault:
     return Fault(sensor=Sensor.GYROS, shape=shape, start_s=start_s, size=size, axes=(2,))
 
 
+def any_gyro_jumps(rng: Rng, end_s: float) -> Fault:
+    """Draw a gyro whose bias jumps by 0.05 to 2 deg/s."""
+    size = math.radians(math.exp(rng.uniform(math.log(0.05), math.log(2.0))))
+    size *= float(rng.choice([-1.0, 1.0]))
+    axes, start_s = (int(rng.integers(3)),), _onset(rng, end_s)
+    return Fault(sensor=Sensor.GYROS, start_s=start_s, size=size, axes=axes)
+
+
 LIES = {
     "two opposite beams, ±0.03 to 0.08 m/s, 100 to 200 s": Lie(two_opposite, ("DVL",)),
     "two adjacent beams, 0.04 to 0.1 m/s, 60 to 150 s": Lie(two_beams, ("DVL",)),
@@ -254,6 +262,7 @@ LIES = {
     "depth 0.5 to 2 m off, 60 to 150 s": Lie(depth_off, ("depth",)),
     "depth frozen, 60 to 150 s": Lie(depth_frozen, ("depth",)),
     "gyro about the vertical reads 0 for 20 s": Lie(gyro_stuck, INERTIAL),
+    "bias of one gyro jumps by 0.05 to 2 deg/s": Lie(any_gyro_jumps, INERTIAL),
     "equal inertial rows, 5 to 10 s": Lie(imu_frozen, INERTIAL),
     "inertial data low-passed at 1 Hz": Lie(imu_low_passed, (*INERTIAL, "clock")),
     "inertial noise ten times the stated": Lie(imu_noisy, (*INERTIAL, "inertial")),

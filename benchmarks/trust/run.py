@@ -248,13 +248,15 @@ def line(label: str, grade: str, runs: Sequence[Run]) -> list[str]:
 
 
 def lost(cells: Sequence[tuple[Key, Run]]) -> list[str]:
-    """Return a table of the missions that are neither right nor said, and beyond their sigmas."""
+    """Return a table of missions neither right nor said, and beyond their sigmas, if there are."""
     rows = []
     for key, run in cells:
         if run.is_lost:
             z, is_named = number_text(run.z), "yes" if run.is_named else "no"
             what = (run.kind or str(key[0]), str(key[1]), str(key[2]))
             rows.append([*what, run.status, f"{run.ratio:.3g}", z, is_named])
+    if not rows:
+        return []
     header = ("what lies", "grade", "seed", "status", "ratio", "z, sigma", "named")
     return ["", "Neither right nor said, and beyond 5 sigma:", "", *table(header, rows)]
 

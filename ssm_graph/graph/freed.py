@@ -10,9 +10,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
+import numpy as np
+
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.extras import Extra, Extras
 from ssm_graph.graph.aids.aid import Linearised
+from ssm_graph.mission.problem import Problem
 
 FAULTS: Final = "faults"
 """The name of these constants among the extra variables of a problem, the last of all."""
@@ -36,6 +39,26 @@ class Freed:
         """The variable that a problem is given for them."""
         labels = tuple(f"fault_{i + 1}" for i in range(len(self.sigma)))
         return Extra(FAULTS, labels, self.sigma)
+
+    @classmethod
+    def nothing(cls, problem: Problem) -> Freed:
+        """Return none of a problem's numbers."""
+        of_beams = np.zeros((len(problem.beams.speed), 0))
+        return cls(np.zeros(0), of_beams, np.zeros((problem.n_keyframes - 1, 15, 0)))
+
+    def with_between(self, sigma: Array, between: Array) -> Freed:
+        """Return the same with further numbers, of sigmas (P,), on the inertial rows alone."""
+
+        def wider(columns: Array) -> Array:
+            more = np.zeros((*columns.shape[:-1], len(sigma)))
+            return np.concatenate([columns, more], axis=-1)
+
+        return Freed(
+            np.concatenate([self.sigma, sigma]),
+            wider(self.beams),
+            np.concatenate([self.between, between], axis=-1),
+            {name: wider(columns) for name, columns in self.aids.items()},
+        )
 
     def on_aid(self, name: str, rows: Linearised, extras: Extras, constants: Array) -> Linearised:
         """Return whitened rows (m, d) of an aid with what it is off by."""

@@ -50,7 +50,7 @@ class GraphLinearizer:
 
     def __init__(self, problem: Problem, freed: Freed | None = None) -> None:
         """Take a problem, and what sensors are off by: with the last of its constants for it."""
-        self.problem, self._freed = problem, freed
+        self.problem, self.freed = problem, freed
         self.intervals = problem.chain.intervals
         """Of the inertial data, about errors of the sensors near the states"""
         self._chain = problem.chain
@@ -87,10 +87,10 @@ class GraphLinearizer:
         """Linearise all beams at ``states``."""
         prepared = self._beams.prepare(states.walks, states.constants, states.bias)
         rows = self._beams.rows(self._at_beams(states), prepared)
-        if self._freed is None:
+        if self.freed is None:
             return rows
-        rows.jacobian[:, self.problem.extras.columns(FAULTS)] = self._freed.beams
-        return rows._replace(error=rows.error + self._freed.beams @ self._off_by(states))
+        rows.jacobian[:, self.problem.extras.columns(FAULTS)] = self.freed.beams
+        return rows._replace(error=rows.error + self.freed.beams @ self._off_by(states))
 
     def solve(
         self, states: States, beam_rows: BeamRows, weights: Array, aid_weights: Array | None = None
@@ -132,15 +132,15 @@ class GraphLinearizer:
     @property
     def has_freed_beam(self) -> NDArray[np.bool_]:
         """Which of the beam speeds (M,) something was freed on."""
-        if self._freed is None:
+        if self.freed is None:
             return np.zeros(len(self.problem.beams.speed), np.bool_)
-        return np.asarray(self._freed.beams.any(axis=1))
+        return np.asarray(self.freed.beams.any(axis=1))
 
     def inertial_rows(self, states: States) -> Array:
         """Return the rows of inertial data and walks, see :class:`InertialRows`."""
         rows = self._inertial.rows(self.intervals, states)
-        if self._freed is not None:
-            own, extras = self._freed.between, self.problem.extras
+        if self.freed is not None:
+            own, extras = self.freed.between, self.problem.extras
             columns = extras.columns(FAULTS)
             rows[:, :STATE_DIM, extras.state_dim :][..., columns] = own
             rows[:, :STATE_DIM, -1] -= own @ self._off_by(states)
@@ -149,8 +149,8 @@ class GraphLinearizer:
     def inertial_errors(self, states: States) -> Array:
         """Return the whitened errors (K - 1, n) of inertial data, then of the walks."""
         errors = self._inertial.errors(self.intervals, states)
-        if self._freed is not None:
-            errors[:, :STATE_DIM] += self._freed.between @ self._off_by(states)
+        if self.freed is not None:
+            errors[:, :STATE_DIM] += self.freed.between @ self._off_by(states)
         return errors
 
     def cost(
@@ -172,8 +172,8 @@ class GraphLinearizer:
 
     def _off_by(self, states: States) -> Array:
         """Return what sensors are off by (F,)."""
-        assert self._freed is not None
-        return states.constants[len(states.constants) - len(self._freed.sigma) :]
+        assert self.freed is not None
+        return states.constants[len(states.constants) - len(self.freed.sigma) :]
 
     def _at_beams(self, states: States) -> RowStates:
         g_n = self.problem.frame.g_n_at(states.p_n)

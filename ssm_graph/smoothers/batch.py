@@ -27,7 +27,6 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps, at_once
 from ssm_graph.engine.chain import ChainSolution
 from ssm_graph.engine.error_state import STATE_DIM
-from ssm_graph.engine.reweighting import NEAR_SIGMAS
 from ssm_graph.engine.states import States
 from ssm_graph.graph.beacon_start import ambiguous_beacons
 from ssm_graph.graph.beam_rows import BeamRows
@@ -53,7 +52,6 @@ from ssm_graph.smoothers.faults.windows import (
 from ssm_graph.smoothers.passes import Pass, Weights
 from ssm_graph.smoothers.settings import WARM_KERNEL, SmootherConfig
 from ssm_graph.smoothers.track import calibration_of, current_of, undetermined
-from ssm_graph.smoothers.unwound import unwound_steps
 from ssm_graph.smoothers.verdict import (
     MAX_ADAPTATIONS,
     adaptation,
@@ -174,7 +172,7 @@ class SsmSmoother:
         yield 0.03 * problem.n_keyframes
         weights = Weights.begin(self.config, first, linearizer.weighted)
         iterations: list[Iteration] = []
-        status, is_unwound = Status.MAX_ITERATIONS, False
+        status = Status.MAX_ITERATIONS
         for number in range(self.config.max_iterations):
             try:
                 this = yield from self._iterate(linearizer, states, rows, weights, faults)
@@ -190,17 +188,10 @@ class SsmSmoother:
                 on_iteration(number + 1, self.config.max_iterations, iterations[-1])
             is_settled = max(this.update_sigmas, this.weight_change) < self.config.tolerance
             is_settled = is_settled and weights.may_end(this)
-            changed, is_last = None, number + 1 == self.config.max_iterations
-            if this.update_sigmas < NEAR_SIGMAS and not (is_unwound or is_last):
-                is_unwound, wound = True, states
-                states = yield from unwound_steps(linearizer, states, this)
-                if states is not wound:
-                    rows, weights = linearizer.beam_rows(states), weights.after(this, faults)
-                    continue
-            if not is_last:
-                changed = yield from faults.look_steps(
-                    linearizer, states, update_sigmas=this.update_sigmas
-                )
+            changed = None
+            if number + 1 < self.config.max_iterations:
+                to, size = (this.weights, this.aid_weights), this.update_sigmas
+                changed = yield from faults.look_steps(linearizer, states, *to, update_sigmas=size)
             if changed is not None:
                 linearizer, states = changed.linearizer, changed.states
                 rows, anew = linearizer.beam_rows(states), self.config.schedule()
@@ -214,7 +205,9 @@ class SsmSmoother:
             weights = weights.after(this, faults)
         left: list[DetectedFault] = []
         if self.config.fault_search is not None:
-            this, left = yield from self._with_sigmas_steps(linearizer, this, weights, faults)
+            linearizer, this, left = yield from self._with_sigmas_steps(
+                linearizer, this, weights, faults
+            )
         inertial = inertial_fit(linearizer.inertial_rows(this.states), this.step)
         yield 0.02 * problem.n_keyframes
         freed = faults.faults(this.states, inertial)
@@ -227,8 +220,13 @@ class SsmSmoother:
 
     def _with_sigmas_steps(
         self, linearizer: GraphLinearizer, last: Pass, used: Weights, faults: FaultWatch
-    ) -> Steps[tuple[Pass, list[DetectedFault]]]:
-        """Return the last pass with the covariance that residuals ask for, and who errs more."""
+    ) -> Steps[tuple[GraphLinearizer, Pass, list[DetectedFault]]]:
+        """Return the last pass with the covariance that residuals ask for, and who errs more.
+
+        Its linearizer has what may be chance besides.
+        """
+        linearizer, states = yield from faults.allowing_steps(linearizer, last.states)
+        last = last._replace(states=states, beam_rows=linearizer.beam_rows(states))
         problem, aids, known = linearizer.problem, linearizer.weighted, np.ones(len(used.aids))
         t, weights, keyframe_s = last.mahalanobis_sq, last.weights, problem.keyframe_s
         beams_s = keyframe_s[problem.beams.keyframe]
@@ -248,8 +246,8 @@ class SsmSmoother:
         readings = readings_of(
             linearizer, last.states, last.beam_rows.error, last.weights, last.aid_weights
         )
-        left = [one for one in found if one is not None]
-        return last._replace(step=step), [*left, *disagreeing(readings, keyframe_s)]
+        left = [one for one in found if one is not None] + disagreeing(readings, keyframe_s)
+        return linearizer, last._replace(step=faults.covering(step)), left
 
     def _iterate(
         self,

@@ -21,18 +21,18 @@ from ssm_graph.engine.states import States
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.imu.preintegration import Unseen
 from ssm_graph.smoothers.descent import descend_steps
-from ssm_graph.smoothers.passes import Pass
 
 MOST_PASSES: Final = 12
 """Of Gauss-Newton from where the vehicle turns the shorter way."""
 
 
-def unwound_steps(linearizer: GraphLinearizer, states: States, last: Pass) -> Steps[States]:
+def unwound_steps(
+    linearizer: GraphLinearizer, states: States, weights: Array, aid_weights: Array
+) -> Steps[States]:
     """Return the states, or those that turn the shorter way, where these cost less.
 
-    Both are judged by the weights that the last pass led to.
+    Both are judged by the same weights (M,) of the beams, and (A,) of the aids.
     """
-    weights, aid_weights = last.weights, last.aid_weights
     tried = shorter(states, linearizer.problem.chain.unseen, linearizer.problem.keyframe_s)
     if tried is states:
         return states
@@ -59,7 +59,8 @@ def shorter(states: States, unseen: Sequence[Unseen], keyframe_s: Array) -> Stat
     The body's velocities stay as they are, and what follows goes on from where that leads.
     """
     turns = so3.log(states.R_nb[:-1].mT @ states.R_nb[1:])
-    for begin, end in runs_of([bool(one.gap_s and one.rate[2]) for one in unseen]):
+    is_unseen = np.array([bool(one.gap_s and one.rate[2]) for one in unseen], bool)
+    for begin, end in runs_of(is_unseen):
         if abs(float(turns[begin:end, 2].sum())) <= np.pi:
             continue
         R_begin = states.R_nb[begin]

@@ -171,6 +171,20 @@ def test_a_slow_drift_of_depth_is_covered_whenever_it_began(
     assert errors(estimate, sim)[1] < 4.0
 
 
+@pytest.mark.parametrize(("grade", "jump"), [(Grade.NAVIGATION, 0.6), (Grade.TACTICAL, 0.1)])
+def test_a_gyro_that_jumps_is_named(grade: Grade, jump: float) -> None:
+    """Between keyframes, by deg/s: one that no pass follows, one like a push aside; sigmas hold."""
+    fault = Fault(sensor=Sensor.GYROS, start_s=80.4, size=math.radians(jump), axes=(2,))
+    sim = simulated(duration_s=200.0, dvl=QUIET, grade=grade, seed=3)
+    broken = with_faults(sim.mission, (fault,), truth=sim.truth_at)
+    estimate = smoothed(replace(sim, mission=broken.mission))
+    found = max(estimate.faults, key=lambda one: one.treatment.is_blame)
+    assert found.sensor == "gyros"
+    assert abs(found.begin_s - fault.start_s) < 12.0
+    assert (estimate.status is Status.SUSPECT) == bool(found.rivals)
+    assert errors(estimate, sim)[1] < 5.0
+
+
 @pytest.mark.slow
 def test_nothing_is_found_with_realistic_instruments() -> None:
     """Slow noise, heavy tails, scale factors and misalignments are nobody's fault once stated."""

@@ -314,6 +314,8 @@ class Channels:
         calibration = calibration_columns(problem, states)
         made[:, self.of(SCALE).columns] = calibration[:, :1]
         made[:, self.of(MOUNTING).columns] = calibration[:, 1:]
+        # What gyros are off by turns the instrument about the vehicle's origin as well.
+        made[:, self.of(IMU).columns][:, 3:] = -np.cross(beams.lever_arm_b, beams.beam_b)
         return made
 
     def _between(self) -> Array:

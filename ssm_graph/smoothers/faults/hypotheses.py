@@ -170,6 +170,10 @@ def _of_inertial() -> Iterator[Hypothesis]:
     unit = np.eye(6)
     yield Hypothesis("accelerometers", IMU, unit[:, :3], np.full(3, 0.3), _forces, handicap=12.0)
     yield Hypothesis("gyros", IMU, unit[:, 3:], np.full(3, 0.1), _rates, handicap=12.0)
+    for axis in range(3):
+        say = partial(_rate, axis)
+        one = unit[:, [3 + axis]]
+        yield Hypothesis("gyros", IMU, one, np.full(1, 0.1), say, handicap=12.0)
 
 
 def of_aid(name: str, dim: int) -> Iterator[Hypothesis]:
@@ -263,6 +267,10 @@ def _forces(s: Array) -> str:
 def _rates(s: Array) -> str:
     x, y, z = np.degrees(s)
     return f"off by {x:+.2g}, {y:+.2g}, {z:+.2g} deg/s about x, y, z"
+
+
+def _rate(axis: int, s: Array) -> str:
+    return f"off by {math.degrees(s[0]):+.2g} deg/s about {'xyz'[axis]}"
 
 
 def _level(s: Array) -> str:

@@ -20,8 +20,7 @@ from ssm_graph.engine.error_state import POSITION
 from ssm_graph.smoothers.faults.columns import TREND_S, Channels
 from ssm_graph.smoothers.faults.hypotheses import Course
 from ssm_graph.smoothers.faults.judged import Fault, Judge
-from ssm_graph.smoothers.faults.search import SAME_ANSWER_SIGMAS, FaultSearch, Look
-from ssm_graph.smoothers.faults.unstated import Unstated
+from ssm_graph.smoothers.faults.search import SAME_ANSWER_SIGMAS, Beside, FaultSearch, Look
 
 
 class Piece(NamedTuple):
@@ -77,17 +76,12 @@ class PieceSearch:
             found.append((piece, own))
         return joined_of(found)
 
-    def unstated(
-        self, judge: Judge, channels: Channels, known: Sequence[Fault]
-    ) -> tuple[Unstated | None, list[Fault]]:
-        """Return what the first piece says of what instruments do not state: it is so in all.
-
-        And jumps that may be instead of it.
-        """
+    def beside(self, judge: Judge, channels: Channels, known: Sequence[Fault]) -> Beside:
+        """Return what the first piece says of what there may be beside: it is so in all."""
         keyframe_s = judge.linear.problem.keyframe_s
         piece = pieces_of(keyframe_s, self._settings.piece_s)[0]
         look = Look(judge, channels, self._settings, (piece.begin, piece.end))
-        return look.unstated(parts_of(known, piece, keyframe_s))
+        return look.beside(parts_of(known, piece, keyframe_s))
 
 
 def _has_moved(by_n: Array, variance: Array) -> bool:

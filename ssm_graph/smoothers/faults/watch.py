@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from factors.similarity import WEIGHT_FLOOR
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps
+from ssm_graph.engine.chain import ChainSolution
 from ssm_graph.engine.extras import Extras
 from ssm_graph.engine.reweighting import NEAR_SIGMAS
 from ssm_graph.engine.states import States
-from ssm_graph.graph.freed import Freed
+from ssm_graph.graph.freed import FAULTS, Freed
 from ssm_graph.graph.inertial_rows import InertialFit, inertial_fit
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.measurements import aids_of
@@ -37,9 +38,10 @@ from ssm_graph.smoothers.faults.hypotheses import Course
 from ssm_graph.smoothers.faults.judged import Fault, Judge
 from ssm_graph.smoothers.faults.nuisances import Nuisances
 from ssm_graph.smoothers.faults.pieces import PieceSearch
-from ssm_graph.smoothers.faults.search import FaultSearch, with_rivals
+from ssm_graph.smoothers.faults.search import Beside, FaultSearch, with_rivals
 from ssm_graph.smoothers.faults.unstated import WIDER, Unstated
 from ssm_graph.smoothers.faults.windows import noisier_than_stated
+from ssm_graph.smoothers.unwound import unwound_steps
 
 MOST_LOOKS = 8
 """Looks after which the search ends whatever it finds."""
@@ -76,9 +78,13 @@ class FaultWatch:
         """What instruments were found to err in beyond what they state"""
         self._undecided: list[Fault] = []
         """The last of what was found: what may be instead of that, which is judged no more"""
+        self._possible: list[Fault] = []
+        """What may be chance: nothing is taken off, the sigmas allow for it"""
+        self._on_possible = np.zeros((problem.n_keyframes - 1, 15, 0))
+        """(K - 1, 15, P) what it does to the whitened inertial rows"""
         self._contradicted: list[DetectedFault] = []
         """What the inertial data contradicted before that was allowed for"""
-        self._is_statement_judged = self._is_let_back = False
+        self._is_statement_judged = self._is_let_back = self._is_unwound = False
         self._beams_out = np.zeros(len(problem.beams.speed), bool)
         self.aids_out = np.zeros(sum(len(aid) for aid in aids_of(problem)), bool)
         """(A,) measurements of aids that may have read anything"""
@@ -94,17 +100,34 @@ class FaultWatch:
         return np.where(self.aids_out, WEIGHT_FLOOR, weights)
 
     def look_steps(
-        self, linearizer: GraphLinearizer, states: States, *, update_sigmas: float
+        self,
+        linearizer: GraphLinearizer,
+        states: States,
+        weights: Array,
+        aid_weights: Array,
+        *,
+        update_sigmas: float,
     ) -> Steps[Changed | None]:
-        """Search once the solution is near; return what has changed, None for nothing.
+        """Look once the solution is near; return what has changed, None for nothing.
 
-        What is found is freed; then it is searched again at what the solution has become, until
-        nothing changes any more. ``linearizer`` is that of the pass.
+        First for circles that nobody saw. Then what is found by a search is freed, and it is
+        searched again at what the solution has become, until nothing changes any more.
+        ``linearizer`` is that of the pass, the weights (M,) and (A,) are those that it led to.
         """
-        if self._is_done or self._bare is None or self._search is None:
+        is_near = update_sigmas < NEAR_SIGMAS
+        if is_near and not self._is_unwound:
+            self._is_unwound, wound = True, states
+            states = yield from unwound_steps(linearizer, states, weights, aid_weights)
+            if states is not wound:
+                return Changed(linearizer, states, weights, aid_weights)
+        if self._is_done or not (is_near or self._is_slow(update_sigmas)):
             return None
-        if update_sigmas >= NEAR_SIGMAS and not self._is_slow(update_sigmas):
-            return None
+        return (yield from self._search_steps(linearizer, states))
+
+    def _search_steps(self, linearizer: GraphLinearizer, states: States) -> Steps[Changed | None]:
+        """Search at the states, and free what is found."""
+        assert self._bare is not None
+        assert self._search is not None
         self._n_looks += 1
         own = states.constants[: self._problem.extras.n_constants]
         bare_states = states._replace(constants=own)
@@ -118,23 +141,14 @@ class FaultWatch:
         yield 0.02 * self._problem.n_keyframes
         known = self._sized(states)[: len(self._found) - len(self._undecided)]
         found = yield from self._search.find_steps(judge, channels, known)
-        found.extend(self._undecided)
-        is_same = same_faults(found, self._found, self._problem.keyframe_s)
+        is_same = same_faults([*found, *self._undecided], self._found, self._problem.keyframe_s)
         if is_same and not self._is_let_back:
-            self._is_let_back = True
+            self._is_let_back, n_found = True, len(found)
             found = let_back(found)
-            is_same = len(found) == len(self._found)
+            is_same = len(found) == n_found
         if is_same and not self._is_statement_judged:
-            self._is_statement_judged = True
-            self._unstated, self._undecided = self._search.unstated(judge, channels, known)
-            found.extend(self._undecided)
-            if self._unstated is not None:
-                is_same = False
-                fit = inertial_fit(linear.inertial_rows(), linear.solution)
-                self._contradicted = noisier_than_stated(fit, self._problem.keyframe_s)
-                chain = self._unstated.widened(self._problem.chain)
-                self._problem = replace(self._problem, chain=chain)
-                self._bare = GraphLinearizer(self._problem)
+            is_same = self._judge_statement(self._search.beside(judge, channels, known), judge)
+        found.extend(self._undecided)
         self._is_done = is_same or self._n_looks >= MOST_LOOKS
         if is_same:
             return None
@@ -157,6 +171,21 @@ class FaultWatch:
             self.leave_aids_out(np.concatenate([np.zeros(0), *linear.aid_weights.values()])),
         )
 
+    def _judge_statement(self, found: Beside, judge: Judge) -> bool:
+        """Keep what there may be beside the faults; return whether the answer stays as it is."""
+        self._is_statement_judged = True
+        self._unstated, self._undecided, self._possible = found
+        between, time_s = judge.channels.between, self._problem.keyframe_s
+        of_imu = {IMU: between}
+        self._on_possible = _columns(self._possible, of_imu, np.arange(len(between)), time_s)
+        if self._unstated is None:
+            return not self._undecided
+        fit = inertial_fit(judge.linear.inertial_rows(), judge.linear.solution)
+        self._contradicted = noisier_than_stated(fit, time_s)
+        self._problem = replace(self._problem, chain=self._unstated.widened(self._problem.chain))
+        self._bare = GraphLinearizer(self._problem)
+        return False
+
     def _is_slow(self, update_sigmas: float) -> bool:
         """Return whether passes come no nearer: what is off bends the answer beyond their reach."""
         is_slower = update_sigmas > SLOW * self._last_update
@@ -166,6 +195,36 @@ class FaultWatch:
             return False
         self._n_slow = 0
         return True
+
+    def allowing_steps(
+        self, linearizer: GraphLinearizer, states: States
+    ) -> Steps[tuple[GraphLinearizer, States]]:
+        """Return a linearizer and states with what may be chance as further constants, of zero."""
+        if not self._possible:
+            return linearizer, states
+        sigma = np.concatenate([one.hypothesis.sigma for one in self._possible])
+        freed = linearizer.freed or Freed.nothing(self._problem)
+        wide = freed.with_between(sigma, self._on_possible)
+        extras = linearizer.problem.extras.without({FAULTS})
+        problem = replace(linearizer.problem, extras=Extras((*extras.blocks, wide.variable)))
+        constants = np.concatenate([states.constants, np.zeros(len(sigma))])
+        linearizer, states = GraphLinearizer(problem, wide), states._replace(constants=constants)
+        yield from linearizer.integrate_steps(states)
+        linearizer.follow(states)
+        return linearizer, states
+
+    def covering(self, step: ChainSolution) -> ChainSolution:
+        """Return a solution of :meth:`allowing` whose sigmas are those of an answer without it.
+
+        They hold if it is as large as it seems, and nobody took it off.
+        """
+        sizes = np.concatenate(
+            [np.zeros(0), *(s.sizes for s in self._possible if s.sizes is not None)]
+        )
+        covariance = step.constants_cov.copy()
+        at = np.arange(len(covariance) - len(sizes), len(covariance))
+        covariance[at, at] += sizes**2
+        return step._replace(constants_cov=covariance)
 
     def inflation_of(self, name: str) -> float:
         """Return by how much readings of the DVL, or of an aid, say less than white noise would."""
@@ -192,7 +251,7 @@ class FaultWatch:
         beams, time_s = self._problem.beams, self._problem.keyframe_s
         on_array = {
             name: channels.beams[:, channels.of(name).columns]
-            for name in (BEAM, BOTTOM, SCALE, MOUNTING)
+            for name in (BEAM, BOTTOM, SCALE, MOUNTING, IMU)
         }
         on_imu = {IMU: channels.between}
         keyframes = np.arange(len(channels.between))
@@ -266,9 +325,21 @@ class FaultWatch:
                 )
             )
         if self._unstated is not None:
-            n = len(states.constants) - len(self._unstated.errors_sigma)
-            span_s = float(end_s[0]), float(end_s[-1])
-            found.extend(self._unstated.faults(states.constants[n:], *span_s))
+            end = len(states.constants) - len(self._possible)
+            errors = states.constants[end - len(self._unstated.errors_sigma) : end]
+            found.extend(self._unstated.faults(errors, float(end_s[0]), float(end_s[-1])))
+        found.extend(
+            DetectedFault(
+                sensor=one.hypothesis.sensor,
+                what=f"may be {said(one)}",
+                begin_s=float(end_s[one.begin]),
+                end_s=float(end_s[one.end]),
+                chi_sq=one.chi_sq,
+                dof=one.n_constants,
+                treatment=Treatment.ALLOWED,
+            )
+            for one in self._possible
+        )
         left = noisier_than_stated(inertial, self._problem.keyframe_s)
         lines = [one.remedy for one in found if one.treatment is Treatment.WIDENED]
         before = [
