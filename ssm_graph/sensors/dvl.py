@@ -95,6 +95,20 @@ class DvlMount(FrozenArrays):
         largest = np.abs(speed @ null.T) / np.sqrt(sigma**2 @ (null**2).T)
         return np.asarray(largest.max(axis=-1))
 
+    def as_stated(self) -> DvlMount:
+        """Return the mount as one that is exact."""
+        return replace(
+            self,
+            misalignment_sigma=0.0,
+            scale_sigma=0.0,
+            scale_walk_density=0.0,
+            beam_scale_sigma=0.0,
+            lever_arm_sigma=0.0,
+            time_offset_sigma_s=0.0,
+            drift=Drift(),
+            drift_z_share=1.0,
+        )
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DvlLog(FrozenArrays):
