@@ -101,7 +101,7 @@ def _of(row: Row) -> Sound:
 HEADER: tuple[str, ...] = ("instruments", "grade", "missions", "not CONVERGED", "with blame")
 HEADER += tuple(f"inside {share:g} sigma E / N / U, %" for share in SHARES)
 HEADER += ("NEES / 3", "time with search / without")
-PRICE = ("grade", "missions", "rms by least squares", "sigma by least squares")
+PRICE: tuple[str, ...] = ("grade", "missions", "rms by least squares", "sigma by least squares")
 PRICE += ("price horizontally, %", "price up, %")
 LEGEND = """\
 Not CONVERGED and with blame: missions, and in brackets the largest rate that such a count leaves
