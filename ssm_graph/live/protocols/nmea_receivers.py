@@ -53,6 +53,35 @@ class _Receiver:
     twice_s: float = -math.inf
     """When it last said two places of one time: two receivers, or a time without its fractions."""
 
+    def begin(self, arrival_s: float) -> list[Told]:
+        """Take note that it says a position; return the last, which still waits."""
+        self.heard_s = arrival_s
+        return self.release(None)
+
+    def loses_fix(self, *, has_fix: bool) -> bool:
+        """Take note of whether it has a fix; return whether it had one before and has none now."""
+        is_lost = self.has_fix and not has_fix
+        self.has_fix = has_fix
+        return is_lost
+
+    def wait(self, pending: Pending) -> None:
+        """Have a position wait for its sigmas."""
+        place, last = pending.position, self.last and self.last.position
+        if last and place.utc == last.utc != "" and place[1:3] != last[1:3]:
+            self.twice_s = pending.arrival_s
+        self.pending = self.last = pending
+
+    def take(self, utc: str, sigma_enu: Vector) -> list[Told]:
+        """Return the position that has waited for the sigmas of this time, if one has."""
+        self.gst_follows = self.last is not None and self.last.position.utc == utc
+        is_waited_for = self.pending is not None and self.pending.position.utc == utc
+        return self.release(sigma_enu) if is_waited_for else []
+
+    def find(self, sigma_enu: Vector) -> list[Told]:
+        """Return the position that waits with sigmas that had come before it."""
+        self.gst_follows = False
+        return self.release(sigma_enu)
+
     def release(self, sigma_enu: Vector | None) -> list[Told]:
         """Return the position that waits, by now with its sigmas or without any."""
         pending, self.pending = self.pending, None
@@ -99,16 +128,11 @@ class Receivers:
                     f"got those of talker {shown(speaker.talker)} too"
                 )
             left = known.pop(oldest).release(None)
-        receiver = known.setdefault(speaker, _Receiver(arrival_s))
-        receiver.heard_s = arrival_s
-        return left + receiver.release(None)
+        return left + known.setdefault(speaker, _Receiver(arrival_s)).begin(arrival_s)
 
     def loses_fix(self, speaker: Speaker, *, has_fix: bool) -> bool:
         """Take note of whether a receiver that has begun has a fix; return whether it is lost."""
-        receiver = self._known[speaker]
-        is_lost = receiver.has_fix and not has_fix
-        receiver.has_fix = has_fix
-        return is_lost
+        return self._known[speaker].loses_fix(has_fix=has_fix)
 
     def take(self, pending: Pending) -> list[Told]:
         """Return a position with its sigmas, nothing where it waits for them.
@@ -116,18 +140,14 @@ class Receivers:
         Nothing comes of one whose time another sentence has said already, as where a better one
         begins to be read amid an epoch.
         """
-        receiver, place = self._known[pending.speaker], pending.position
-        last = receiver.last and receiver.last.position
-        if self.has_said(place.utc, not_by=pending.kind):
+        if self.has_said(pending.position.utc, not_by=pending.kind):
             return []
-        if last and place.utc == last.utc != "" and place[1:3] != last[1:3]:
-            receiver.twice_s = pending.arrival_s
-        receiver.pending = receiver.last = pending
+        receiver = self._known[pending.speaker]
+        receiver.wait(pending)
         for speaker, (utc, sigma_enu) in self._gst.items():
-            is_of_time = bool(utc) and utc == place.utc
+            is_of_time = utc == pending.position.utc
             if is_of_time and self._about(speaker, pending.arrival_s) is receiver:
-                receiver.gst_follows = False
-                return receiver.release(sigma_enu)
+                return receiver.find(sigma_enu)
         return [] if receiver.gst_follows else receiver.release(None)
 
     def hear(self, speaker: Speaker, utc: str, sigma: Vector, arrival_s: float) -> list[Told]:
@@ -136,11 +156,7 @@ class Receivers:
             del self._gst[next(iter(self._gst))]
         self._gst[speaker] = utc, sigma
         receiver = self._about(speaker, arrival_s)
-        if receiver is None:
-            return []
-        receiver.gst_follows = receiver.last is not None and receiver.last.position.utc == utc
-        is_waited_for = receiver.pending is not None and receiver.pending.position.utc == utc
-        return receiver.release(sigma) if is_waited_for else []
+        return [] if receiver is None else receiver.take(utc, sigma)
 
     def has_said(self, utc: str, *, not_by: str = "") -> bool:
         """Return whether the last position of any is of this time, by another sentence than one."""
@@ -154,7 +170,7 @@ class Receivers:
     def clear(self) -> None:
         """Forget what waits."""
         for one in self._known.values():
-            one.pending = None
+            one.release(None)
 
     def _about(self, speaker: Speaker, arrival_s: float) -> _Receiver | None:
         """Return whose positions a GST is about, None where that cannot be known, which is told.
