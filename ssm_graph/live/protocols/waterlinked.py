@@ -1,4 +1,4 @@
-"""Reports of the Water Linked DVL-A50 and A125 (JSON over TCP, port 16171) as pings.
+"""Reports of the Water Linked DVL-A50 and A125 (JSON over TCP, port 16171; serial) as pings.
 
 Sign. Over the 269 reports with four beams and a valid velocity of a recorded A50 (December 2021),
 least squares gives the transducers' velocities from (vx, vy, vz), z down, as::
@@ -43,7 +43,8 @@ from ssm_graph.live.protocols.decoder import (
     require,
     shown,
 )
-from ssm_graph.live.protocols.framing import MAX_LENGTH, ObjectFramer
+from ssm_graph.live.protocols.framing import MAX_LENGTH
+from ssm_graph.live.protocols.waterlinked_serial import ReportFramer
 from ssm_graph.sensors.compass import HeadingReading
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.dvl_readings import LARGEST_SPEED
@@ -71,7 +72,7 @@ class BeamRule(Enum):
 
 
 class WaterLinkedDecoder(Decoder):
-    """Velocity reports to pings, in any layout: one a line, spread over lines, back to back.
+    """Velocity reports to pings, as JSON in any layout, or as lines of the serial protocol.
 
     A report without a beam that counts is a ping of missing beams. The same report again (by
     ``time_of_validity``, or by content where there is none) is dropped and counted.
@@ -99,7 +100,7 @@ class WaterLinkedDecoder(Decoder):
         super().__init__(PLACE)
         self.n_repeats = 0
         """How many reports came again and were dropped."""
-        self._framer = ObjectFramer(self._refuse, max_length=max_length)
+        self._framer = ReportFramer(self._refuse, max_length=max_length)
         self._stamper, self._yaw_stamper = (
             Stamper(clock, max_clock_error_s=max_clock_error_s, refusals=self._refusals, place=one)
             for one in (PLACE, f"{PLACE} {_DEAD_RECKONING}")

@@ -32,7 +32,7 @@ from ssm_graph.io.teledyne.ensembles import is_pd0
 from ssm_graph.io.teledyne.pd0 import read_pd0
 from ssm_graph.io.teledyne.short_formats import is_pd6, is_pd45, read_pd6, read_pd45
 from ssm_graph.live.protocols.decoder import RefusedError, parse_object
-from ssm_graph.live.protocols.framing import ObjectFramer, SentenceFramer
+from ssm_graph.live.protocols.framing import MAX_LENGTH, SentenceFramer
 from ssm_graph.live.protocols.nmea import MAX_SENTENCE, PREFERRED_S, NmeaDecoder, NmeaOptions
 from ssm_graph.live.protocols.nmea_fields import (
     DAY_S,
@@ -42,6 +42,7 @@ from ssm_graph.live.protocols.nmea_fields import (
     utc_seconds,
 )
 from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
+from ssm_graph.live.protocols.waterlinked_serial import SERIAL, ReportFramer
 from ssm_graph.live.recorded.water_linked_table import SIGN, rows_of
 from ssm_graph.sensors.compass import HeadingReading
 from ssm_graph.sensors.depth import DepthReading
@@ -109,6 +110,8 @@ def read_recorded(log: Path, options: NmeaOptions | None = None) -> Recorded | N
         found = _water_linked(_OF_PYTHON.sub(lambda found: _PYTHON[found[0]], data))
     elif b'"transducers"' in head or (head.lstrip()[:1] in (b"{", b"[") and b'"' in head):
         found = _water_linked(data)
+    elif SERIAL.search(head):
+        found = _water_linked(data, "Water Linked, serial protocol")
     elif SIGN in head.partition(b"\n")[0]:
         found = _water_linked_table(data)
     elif _SENTENCE.search(head):
@@ -207,10 +210,10 @@ def _said(refusals: list[str], n_refused: int) -> list[str]:
     return [*shown, *((f"{more} more were refused",) if more > 0 else ())]
 
 
-def _water_linked(data: bytes) -> Recorded:
+def _water_linked(data: bytes, name: str = "Water Linked JSON") -> Recorded:
     decoder = WaterLinkedDecoder(heading=True, max_clock_error_s=_ANY_CLOCK_S)
     torn: list[str] = []
-    framer = ObjectFramer(torn.append)
+    framer = ReportFramer(torn.append, max_length=MAX_LENGTH)
     messages: list[Message] = []
     time_s, last_s, before, has_clock = 0.0, -math.inf, dict[str, Any](), True
     for text in told(framer.feed(data + b"\n"), len(data), size=len):
@@ -234,7 +237,7 @@ def _water_linked(data: bytes) -> Recorded:
             "them, from the first one on or from the stamps of the dead reckoning beside them; add "
             "what makes it the vehicle's."
         )
-    return Recorded(_about("Water Linked JSON", messages), tuple(messages), tuple(notes))
+    return Recorded(_about(name, messages), tuple(messages), tuple(notes))
 
 
 def _water_linked_table(data: bytes) -> Recorded:
