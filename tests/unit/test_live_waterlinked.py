@@ -88,6 +88,21 @@ def recorded() -> list[dict[str, Any]]:
 
 
 @needs_logs
+def test_tracking_mode_of_newer_software() -> None:
+    """A velocity in the mode of water track is off the water, whatever its type."""
+    for changes, is_water in (
+        ({"tracking_mode": "bottom"}, False),
+        ({"tracking_mode": "water"}, True),
+        ({"tracking_mode": "water", "type": "velocity_water"}, True),
+        ({"type": "velocity_water"}, True),
+    ):
+        (ping,), refused = read(report(**changes, format="json_v4.1"))
+        assert ping.is_water is is_water
+        assert not refused
+    assert "tracking_mode" in read(report(tracking_mode="dry"))[1][0]
+    assert read({"command": "get_config"}) == ([], [])
+
+
 def test_sign_of_the_instrument(recorded: list[dict[str, Any]]) -> None:
     """Transducer velocities are along beams that point down, out of the transducer."""
     pings, refused = read(*recorded)

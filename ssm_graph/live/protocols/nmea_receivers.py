@@ -13,8 +13,9 @@ from ssm_graph.live.protocols.nmea_fields import Position
 
 LATELY_S: Final = 5.0
 """A receiver that says no position for so long is none whose GST might come."""
-MOST_RECEIVERS: Final = 8
-"""Told apart at one connection."""
+MOST_RECEIVERS: Final = 16
+"""Told apart at one connection. One that writes a GNS for each system of satellites has seven
+talkers."""
 
 
 class Speaker(NamedTuple):

@@ -53,6 +53,8 @@ from ssm_graph.sensors.messages import Message
 PLACE: Final = "water linked"
 _TRACKS: Final = {"velocity": False, "velocity_water": True}
 """Types of reports with beams, and whether they are off the water, as software 2.7 has them."""
+_MODES: Final = {"bottom": False, "water": True}
+"""The tracking mode that software 2.7 states besides."""
 _DEAD_RECKONING: Final = "position_local"
 _IGNORED: Final = frozenset({"response"})
 """Types of the protocol that say nothing of the motion."""
@@ -110,13 +112,15 @@ class WaterLinkedDecoder(Decoder):
 
     def _decode(self, text: str, arrival_s: float) -> list[Message]:
         report = parse_object(text)
+        if "command" in report:  # what somebody asked of it, in a recording of both sides
+            return []
         kind = "velocity" if _is_without_type(report) else require(report, "type")
         if not isinstance(kind, str) or kind not in {*_TRACKS, _DEAD_RECKONING, *_IGNORED}:
             raise RefusedError(f"expected a report of type 'velocity', got {shown(kind)}")
         if kind in _IGNORED or (kind == _DEAD_RECKONING and not self._reads_heading):
             return []
         message = (
-            self._ping(report, arrival_s, is_water=_TRACKS[kind])
+            self._ping(report, arrival_s, is_water=_is_water(report, kind))
             if kind in _TRACKS
             else self._heading(report, arrival_s)
         )
@@ -163,6 +167,14 @@ class WaterLinkedDecoder(Decoder):
         if self._beam_rule is BeamRule.BOTTOM:
             return has_altitude
         return self._beam_rule is BeamRule.EACH
+
+
+def _is_water(report: dict[str, Any], kind: str) -> bool:
+    """Return whether a report is off the water, by its type or the mode of the instrument."""
+    mode = report.get("tracking_mode", "bottom")
+    if not isinstance(mode, str) or mode not in _MODES:
+        raise RefusedError(f"tracking_mode: expected bottom or water, got {shown(mode)}")
+    return _TRACKS[kind] or _MODES[mode]
 
 
 def _is_without_type(report: dict[str, Any]) -> bool:
