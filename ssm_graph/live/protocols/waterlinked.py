@@ -58,8 +58,8 @@ _MODES: Final = {"bottom": False, "water": True}
 _DEAD_RECKONING: Final = "position_local"
 _IGNORED: Final = frozenset({"response"})
 """Types of the protocol that say nothing of the motion."""
-_NUMBERS: Final = ([0, 1, 2], [0, 1, 2, 3])
-"""Of the transducers of an instrument."""
+_MOST, _FEWEST = 4, 3
+"""Transducers of an instrument."""
 _GROUND_ALONE: Final = ("json_v1", "json_v2", "json_v2.1", "json_v3", "json_v3.1")
 """Formats of software before 2.7, which knew no water track: the first has no type, and what passes
 reports on may leave it out."""
@@ -109,6 +109,7 @@ class WaterLinkedDecoder(Decoder):
         )
         self._beam_rule, self._reads_heading = beam_rule, heading
         self._last: dict[str, dict[str, Any]] = {}
+        self._n_beams = _FEWEST
 
     def _decode(self, text: str, arrival_s: float) -> list[Message]:
         report = parse_object(text)
@@ -131,10 +132,11 @@ class WaterLinkedDecoder(Decoder):
         return [message] if message is not None else []
 
     def _ping(self, report: dict[str, Any], arrival_s: float, *, is_water: bool) -> Ping:
-        beams = _transducers(report)
+        beams = _transducers(report, self._n_beams)
+        self._n_beams = max(self._n_beams, len(beams))
         counts = self._counts(report, beams)
         if not is_water:
-            altitude_m = number(report.get("altitude", -1.0), key="altitude")
+            altitude_m = _altitude(report)
             self.altitude_m = altitude_m if altitude_m > 0.0 else math.nan
         speed = tuple(
             float(x["velocity"]) if counts and x["beam_valid"] else math.nan for x in beams
@@ -159,7 +161,7 @@ class WaterLinkedDecoder(Decoder):
     def _counts(self, report: dict[str, Any], beams: list[dict[str, Any]]) -> bool:
         """Return whether the valid beams of a report are to be believed."""
         is_valid = flag(report, "velocity_valid")
-        has_altitude = number(report.get("altitude", -1.0), key="altitude") > 0.0
+        has_altitude = _altitude(report) > 0.0
         if is_valid:
             return True
         if len({beam["velocity"] for beam in beams}) == 1:
@@ -184,23 +186,47 @@ def _is_without_type(report: dict[str, Any]) -> bool:
     return report.get("format", "json_v1") in _GROUND_ALONE
 
 
-def _transducers(report: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the transducers in the order of their numbers, checked."""
+def _transducers(report: dict[str, Any], n_known: int) -> list[dict[str, Any]]:
+    """Return the transducers in the order of their numbers, checked.
+
+    One of which nothing is said is not valid, where the instrument is known to have it.
+    """
     found = require(report, "transducers")
     if not isinstance(found, list) or not all(isinstance(beam, dict) for beam in found):
         raise RefusedError(
             f"transducers: expected a list of 3 or 4 objects, got {shown(str(found))}"
         )
     numbers = [require(beam, "id") for beam in found]
-    if any(type(n) is not int for n in numbers) or sorted(numbers) not in _NUMBERS:
+    are_sound = all(type(n) is int and 0 <= n < _MOST for n in numbers)
+    is_of_three = are_sound and sorted(numbers) == [*range(_FEWEST)]
+    n_beams = _FEWEST if is_of_three else _MOST
+    is_known = len(numbers) == _MOST or n_known == _MOST or is_of_three
+    if not are_sound or len({*numbers}) < len(numbers) or not is_known:
         raise RefusedError(
             f"transducers: expected the numbers 0 to 3, or 0 to 2, got {shown(str(numbers))}"
         )
-    beams = sorted(found, key=lambda beam: int(beam["id"]))
-    for beam in beams:
-        largest = LARGEST_SPEED if flag(beam, "beam_valid") else math.inf
-        number(require(beam, "velocity"), key="velocity", low=-largest, high=largest)
-    return beams
+    said = {int(beam["id"]): beam for beam in found}
+    beams = [said.get(k, {"velocity": 0.0, "beam_valid": False}) for k in range(n_beams)]
+    return [_checked(beam) for beam in beams]
+
+
+def _checked(beam: dict[str, Any]) -> dict[str, Any]:
+    """Return a transducer with a number for its velocity; nothing may stand for one not valid."""
+    is_valid = require(beam, "beam_valid")
+    if not isinstance(is_valid, bool) and is_valid not in (0, 1):  # as tables and databases write
+        raise RefusedError(f"beam_valid: expected true or false, got {shown(is_valid)}")
+    velocity = require(beam, "velocity")
+    if velocity is None and not is_valid:
+        velocity = 0.0
+    largest = LARGEST_SPEED if is_valid else math.inf
+    speed = number(velocity, key="velocity", low=-largest, high=largest)
+    return {"velocity": speed, "beam_valid": bool(is_valid)}
+
+
+def _altitude(report: dict[str, Any]) -> float:
+    """Return the altitude, m; -1 where there is none."""
+    altitude = report.get("altitude")
+    return -1.0 if altitude is None else number(altitude, key="altitude")
 
 
 def _time_of_validity(report: dict[str, Any]) -> float | None:
@@ -208,6 +234,7 @@ def _time_of_validity(report: dict[str, Any]) -> float | None:
     if "time_of_validity" not in report:
         return None
     stamp = report["time_of_validity"]
-    if type(stamp) is not int:
+    is_whole = type(stamp) is int or (isinstance(stamp, float) and stamp.is_integer())
+    if not is_whole:  # tables make floats of whole numbers
         raise RefusedError(f"time_of_validity: expected whole microseconds, got {shown(stamp)}")
     return stamp / 1e6
