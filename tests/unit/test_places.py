@@ -23,6 +23,7 @@ from ssm_graph.live.sockets.places import (
     SETTLED,
     SILENT_S,
     SILENT_TIMES,
+    Known,
     Place,
     Places,
 )
@@ -265,6 +266,23 @@ def test_after_a_kill_the_instrument_is_known_by_its_socket(tmp_path: Path) -> N
             stray.close()
     assert [one.kind for one in places.known()] == [DepthReading]
     own.close()
+
+
+def test_a_place_that_is_called_no_more_keeps_nobody_out() -> None:
+    """A run that is gone on with may call an instrument at another address."""
+    clock = Steady()
+    known = [
+        Known(DepthReading, "dvl, tcp://10.0.0.1:1", f"dvl tcp://10.0.0.1:{k}") for k in (1, 2)
+    ]
+    for port, n_known in ((1, 1), (3, 0)):
+        endpoint = Endpoint(Transport.TCP_CLIENT, "10.0.0.1", port)
+        inputs = [InputConfig("dvl", endpoint, JsonDecoder)]
+        with SocketHub(inputs, steady_s=clock, known=known) as hub:
+            assert len(hub._places.known()) == n_known
+    udp_input = InputConfig("dvl", Endpoint(Transport.UDP, LOOPBACK, 0), JsonDecoder)
+    with SocketHub([udp_input], steady_s=clock, known=known) as hub:
+        assert len(hub._places.known()) == 2
+    assert len(Places(50 * known).known()) == MOST_PLACES
 
 
 @contextmanager

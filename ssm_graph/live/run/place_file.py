@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from ssm_graph.base.settings import parse_json
-from ssm_graph.live.sockets.places import MOST_PLACES, Known
+from ssm_graph.live.sockets.places import Known
 from ssm_graph.sensors.registry import BY_MESSAGE
 
 PLACES_NAME: Final = "places.json"
@@ -36,13 +36,12 @@ class PlaceFile:
         except (OSError, ValueError):
             return []
         rows = found if isinstance(found, list) else []
-        known = [
+        return [
             Known(_BY_NAME[row[0]], row[1], row[2])
             for row in rows
             if isinstance(row, list) and len(row) == 3 and all(isinstance(x, str) for x in row)
             if row[0] in _BY_NAME
         ]
-        return known[: MOST_PLACES * len(_BY_NAME)]
 
     def note(self, known: Iterable[Known]) -> str | None:
         """Write them in place of those of before; return why it could not be."""

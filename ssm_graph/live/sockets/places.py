@@ -151,7 +151,8 @@ class Places:
         self._voices: dict[type[Message], list[_Voice]] = {}
         for kind, name, host in known:
             voice = _Voice(Place(name, host, is_left=True), steady_s, LONGEST_INTERVAL_S, SETTLED)
-            self._voices.setdefault(kind, []).append(voice)
+            voices = self._voices.setdefault(kind, [])
+            voices += [voice] if len(voices) < MOST_PLACES else []
 
     def known(self) -> tuple[Known, ...]:
         """Return the places that keep others out, by which a process that follows knows them."""

@@ -80,7 +80,8 @@ class SocketHub:
         self._begin_s = self._polled_s = steady_s()
         self._clock = RunClock(wall_s, steady_s, set_by_s)
         self._note_clock = note_clock
-        self._stamps, self._places = StampClocks(self._clock), Places(known, self._begin_s)
+        self._stamps = StampClocks(self._clock)
+        self._places = Places(_still_there(known, inputs), self._begin_s)
         self._note_places, self._noted, self._noted_s = note_places, self._places.known(), -math.inf
         self._events = EventLog(lambda: self.time_s, steady_s)
         self._selector = selectors.DefaultSelector()
@@ -269,3 +270,11 @@ class SocketHub:
         if config.endpoint.transport is Transport.UDP:
             return UdpOutput(config.form, config.endpoint, self._events)
         return TcpServerOutput(config.form, config.endpoint, self._events, self._selector)
+
+
+def _still_there(known: Iterable[Known], inputs: Sequence[InputConfig]) -> list[Known]:
+    """Return known places without those that nobody calls or listens for any more."""
+    calls = (Transport.TCP_CLIENT, Transport.SERIAL)
+    dialled = {f"{one.name} {one.endpoint}" for one in inputs if one.endpoint.transport in calls}
+    heard = tuple(f"{one.name} " for one in inputs if one.endpoint.transport not in calls)
+    return [one for one in known if one.host in dialled or one.host.startswith(heard)]
