@@ -111,6 +111,29 @@ def test_damage_costs_a_beam_or_a_ping() -> None:
     np.testing.assert_allclose(speeds(found), expected, atol=6e-4)
 
 
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ("wru,0,0.1", "3 fields or more, got 2"),
+        ("wru", "3 fields or more, got 0"),
+        ("wru,4,0.1,1.0,-40,-95", "numbers 0 to 3, got 4"),
+        ("wru,0,nan,1.0,-40,-95", "velocity: expected a number"),
+        ("wrz,0.1,0.1,0.1,y,1.0", "expected 11 fields, got 5"),
+        ("wrz,0.1,0.1,0.1,x,1.0,0.1,0;0,7,14,100.0,0", "y or n"),
+        ("wrz,0.1,0.1,0.1,y,1.0,0.1,0;0,-7,14,100.0,0", "whole microseconds"),
+        ("wrp,1.0,2.0", "expected 9 fields, got 2"),
+        ("wrq,1", "expected wrz, wrs, wru or wrp"),
+    ],
+)
+def test_lines_that_are_no_sound_ones(body: str, said: str) -> None:
+    """Their checksum is right; one sentence each, and the next ping is read."""
+    lines, speed = pings(2)
+    found, refused = fed(lines[0] + serial_line(body) + lines[1])
+    np.testing.assert_allclose(speeds(found), speed, atol=6e-4)
+    (text,) = refused
+    assert said in text
+
+
 def test_no_lock_and_water_track() -> None:
     """A velocity that is not valid and no altitude: no beam counts; wrs is off the water."""
     (ping,), _ = pings(1)

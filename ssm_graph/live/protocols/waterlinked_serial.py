@@ -229,10 +229,11 @@ def _velocity(fields: list[str], names: tuple[str, ...]) -> dict[str, Any]:
 
 def _transducer(fields: list[str]) -> tuple[int, dict[str, Any]]:
     """Return number and speed of a transducer; one that heard nothing has a distance of -1."""
-    number, speed, distance = (
-        required_number(field, name)
-        for field, name in zip(fields, ("id", "velocity", "distance"), strict=False)
-    )
+    names = ("id", "velocity", "distance")
+    if len(fields) < len(names):
+        raise RefusedError(f"transducer: expected 3 fields or more, got {len(fields)}")
+    said = zip(fields[: len(names)], names, strict=True)
+    number, speed, distance = (required_number(field, name) for field, name in said)
     if number not in range(N_BEAMS):
         raise RefusedError(f"transducer: expected the numbers 0 to {N_BEAMS - 1}, got {number:g}")
     return int(number), {"id": int(number), "velocity": speed, "beam_valid": distance > 0.0}
@@ -259,4 +260,4 @@ def _misfit(head: Mapping[str, Any], beams: Mapping[int, dict[str, Any]]) -> flo
     horizontal = math.hypot(c + d - a - b, a + d - b - c) / (4.0 * _SIN)
     vertical = (a + b + c + d) / (4.0 * _COS)
     off = horizontal - math.hypot(head["vx"], head["vy"]), vertical - head["vz"]
-    return off[0] ** 2 + off[1] ** 2
+    return float(off[0] ** 2 + off[1] ** 2)
