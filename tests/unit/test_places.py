@@ -265,6 +265,7 @@ def test_after_a_kill_the_instrument_is_known_by_its_socket(tmp_path: Path) -> N
             receiver.poll()
             stray.close()
     assert [one.kind for one in places.known()] == [DepthReading]
+    assert own is not None
     own.close()
 
 

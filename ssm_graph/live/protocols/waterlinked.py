@@ -237,4 +237,4 @@ def _time_of_validity(report: dict[str, Any]) -> float | None:
     is_whole = type(stamp) is int or (isinstance(stamp, float) and stamp.is_integer())
     if not is_whole:  # tables make floats of whole numbers
         raise RefusedError(f"time_of_validity: expected whole microseconds, got {shown(stamp)}")
-    return stamp / 1e6
+    return float(stamp) / 1e6

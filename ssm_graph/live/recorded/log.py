@@ -287,7 +287,7 @@ def _object(text: str) -> dict[str, Any]:
 
 def _between(report: Mapping[str, Any]) -> float:
     """Return the time since the report before, s; 0 where it is not said."""
-    value = report.get("time")
+    value: Any = report.get("time")
     is_sound = isinstance(value, (int, float)) and not isinstance(value, bool)
     return 1e-3 * float(value) if is_sound and 0.0 <= value < 1e6 else 0.0
 
