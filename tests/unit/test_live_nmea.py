@@ -168,6 +168,22 @@ def test_of_two_receivers_that_are_not_told_apart_no_sigmas_are_taken(epoch: str
     assert "tag block" in text
 
 
+def test_a_gns_for_each_system_of_satellites() -> None:
+    """The first has the place; the others are no receivers without a fix."""
+    place = "6326.0000,N,01024.0000,E,AAN,14,0.9,5.5,6.5,,"
+    bodies = (
+        f"GNGNS,120000.00,{place}",
+        "GPGNS,120000.00,,,,,,7,,,,,",
+        "GLGNS,120000.00,,,,,,5,,,,,",
+    )
+    decoder = NmeaDecoder(only=("GNS",))
+    fixes = decoder.feed(b"".join(map(sentence, bodies)) * 3, arrival_s=NOON_S)
+    assert len(fixes) == 3
+    assert decoder.n_without_fix == decoder.n_refused == 0
+    decoder.feed(sentence("GPGNS,120001.00,,,,,,0,,,,,"), arrival_s=NOON_S + 1.0)
+    assert decoder.n_without_fix == 1
+
+
 def test_a_receiver_may_say_its_sigmas_as_another_talker() -> None:
     """GPGGA and GNGST, as where satellites of several systems are used."""
     (_, south), refused = sigmas_of_two("Ba")

@@ -21,6 +21,7 @@ from ssm_graph.live.protocols.nmea_fields import (
     POSITIONS,
     DepthSentence,
     Position,
+    is_beside,
     optional_number,
     split_sentence,
     utc_seconds,
@@ -187,6 +188,8 @@ class NmeaDecoder(Decoder):
         self, speaker: Speaker, kind: str, fields: list[str], arrival_s: float
     ) -> list[Message] | None:
         """Return the messages of a sentence, None for one that is not looked at."""
+        if is_beside(kind, fields):
+            return []
         if kind in POSITIONS:
             return self._on_position(speaker, kind, fields, arrival_s)
         if kind == "GST":
