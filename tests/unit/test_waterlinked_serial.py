@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
 from ssm_graph.live.protocols.waterlinked_serial import crc8
@@ -132,6 +133,20 @@ def test_lines_that_are_no_sound_ones(body: str, said: str) -> None:
     np.testing.assert_allclose(speeds(found), speed, atol=6e-4)
     (text,) = refused
     assert said in text
+
+
+def test_the_first_version_alone_is_told(tmp_path: Path) -> None:
+    """Once, and what to set; beside the second it is passed over."""
+    old = serial_line("wrx,112.83,0.007,0.017,0.006,0.000,0.93,y,0")
+    old += serial_line("wrt,15.00,15.20,14.90,14.20")
+    log = tmp_path / "old.log"
+    log.write_bytes(30 * old)
+    with pytest.raises(DataError, match="WL - Serial V2"):
+        read_recorded(log)
+    lines, _ = pings(9)
+    found, refused = fed(b"".join(old + one for one in lines))
+    assert len(found) == 9
+    assert not refused
 
 
 def test_no_lock_and_water_track() -> None:

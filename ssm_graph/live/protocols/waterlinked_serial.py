@@ -29,10 +29,16 @@ _UNDECIDED: Final = 4096
 """Bytes without a begin of either protocol, after which JSON is expected."""
 _LINE = re.compile(r"\bwr([a-zA-Z])((?:,[^,*]*)*)\*([0-9A-Fa-f]{2})\Z", re.ASCII)
 _BEGIN: Final = re.compile(rb"(?:\A|[\r\n])[^{\r\n]{0,40}\bwr[a-zA-Z],")
-SERIAL: Final = re.compile(rb"(?:\A|[\r\n])[^{\r\n]{0,40}\bwr[zsu],[^*\r\n]{1,400}\*[0-9A-Fa-f]{2}")
+SERIAL: Final = re.compile(
+    rb"(?:\A|[\r\n])[^{\r\n]{0,40}\bwr[zsuxt],[^*\r\n]{1,400}\*[0-9A-Fa-f]{2}"
+)
 """A recording of the serial protocol has it."""
-_NOT_READ: Final = frozenset("xtvwcanNT")
-"""Kinds of the first version, and answers to commands."""
+_NOT_READ: Final = frozenset("vwcanNT")
+"""Answers to commands."""
+_OLD: Final = frozenset("xt")
+"""Kinds of the first version."""
+_MANY_OLD: Final = 10
+"""Without one of the second between: nothing else comes."""
 _SIN, _COS = math.sin(math.pi / 8.0) / math.sqrt(2.0), math.cos(math.pi / 8.0)
 """Of a beam along each horizontal axis, and along the vertical one."""
 _FORGET: Final = 0.9
@@ -128,6 +134,8 @@ class SerialReports:
         """What transducers have said since."""
         self._is_used = False
         """Whether they went with a report."""
+        self._n_old = 0
+        """Lines of the first version since one of the second."""
         self._misfit_after = self._misfit_before = 0.0
         """Of transducers after their velocity, and before it, (m/s)²."""
 
@@ -148,13 +156,19 @@ class SerialReports:
             return []
 
     def _read(self, kind: str, fields: list[str]) -> list[str]:
+        self._n_old = self._n_old + 1 if kind in _OLD else 0
+        if self._n_old == _MANY_OLD:
+            raise RefusedError(
+                "wrx and wrt come alone, which say no speed along a beam; set the output of the "
+                "instrument to WL - Serial V2 (wcp,3)"
+            )
         if kind == "u":
             return self._on_beam(fields)
         if kind == "z" or (kind == "s" and len(fields) == len(_WATER)):  # else a time status
             return self._on_velocity(fields, is_water=kind == "s")
         if kind == "p":
             return [_dead_reckoning(fields)]
-        if kind not in _NOT_READ and kind != "s":
+        if kind not in _NOT_READ | _OLD and kind != "s":
             raise RefusedError(f"expected wrz, wrs, wru or wrp, got {shown('wr' + kind)}")
         return []
 
