@@ -22,7 +22,14 @@ from ssm_graph.live.recorded.log import read_recorded
 from ssm_graph.mission.mission import Mission
 from ssm_graph.sensors.messages import Message, bad_number
 from ssm_graph.simulation import GnssSettings
-from tests.damaged_traffic import MAX_FAILURES, START_S, damaged, nmea_traffic, waterlinked_traffic
+from tests.damaged_traffic import (
+    MAX_FAILURES,
+    START_S,
+    damaged,
+    nmea_traffic,
+    serial_traffic,
+    waterlinked_traffic,
+)
 from tests.helpers import simulated
 from tests.rosbag_fixture import Ros, marine_bag, ros1_bag, write_bag
 from tests.unit.test_ardupilot import dataflash, tlog
@@ -138,6 +145,7 @@ def file_targets(folder: Path) -> list[FileTarget]:
     old = ros1_bag(folder / "old.bag", mission, ros)
     return [
         FileTarget("Water Linked JSON", _stream(waterlinked_traffic), _recorded, ".json"),
+        FileTarget("Water Linked, serial protocol", _stream(serial_traffic), _recorded, ".txt"),
         FileTarget("Water Linked table", as_table(reports(200, "json_v2")), _recorded, ".csv"),
         FileTarget("NMEA 0183", _stream(nmea_traffic), _recorded, ".nmea"),
         FileTarget("ROS 2, MCAP", mcap.read_bytes(), bag, ".mcap"),

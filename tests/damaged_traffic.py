@@ -25,6 +25,7 @@ from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.magnetometer import MagneticReading
 from ssm_graph.sensors.messages import Message, bad_number
 from ssm_graph.sensors.standstill import RestReading
+from tests.water_linked_fixture import serial_line
 
 START_S = 1_700_000_000.0
 MAX_HELD = MAX_LENGTH + 16
@@ -95,6 +96,18 @@ def waterlinked_traffic(rng: random.Random, time_s: float) -> bytes:
     }
     indent = 4 if rng.random() < 0.3 else None
     return json.dumps(report, indent=indent).encode() + rng.choice([b"\n", b"\r\n", b",\n", b""])
+
+
+def serial_traffic(rng: random.Random, time_s: float) -> bytes:
+    """Return a ping of a DVL at a serial port, and what comes between two."""
+    micro_s = int((time_s - 0.15) * 1e6)
+    head = f"{rng.gauss(0.0, 0.3):.3f},0.017,0.006,{rng.choice('yyyn')}"
+    tail = f"0.001,1e-07;0;0;0;1e-07;0;0;0;1e-08,{micro_s},{micro_s + 150_000},112.83,0"
+    bodies = [rng.choice([f"wrz,{head},0.93,{tail}", f"wrs,{head},{tail}"])]
+    bodies += [f"wru,{k},{rng.gauss(0.0, 0.3):.3f},1.1,-40,-95" for k in range(4)]
+    if rng.random() < 0.3:
+        bodies += [f"wrp,{time_s:.3f},0.4,0.2,1.2,0.4,53.9,13.0,19.3,0", "wra", "wrv,2,5,0"]
+    return b"".join(map(serial_line, bodies))
 
 
 def nmea_traffic(rng: random.Random, time_s: float) -> bytes:
@@ -180,6 +193,7 @@ def targets() -> list[Target]:
         Target("json", JsonDecoder(), json_traffic),
         Target("water linked", WaterLinkedDecoder(), waterlinked_traffic),
         Target("water linked, every beam", _each_beam(), waterlinked_traffic),
+        Target("water linked, serial", WaterLinkedDecoder(heading=True), serial_traffic),
         Target("nmea", NmeaDecoder(), nmea_traffic),
     ]
 

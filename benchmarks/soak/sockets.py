@@ -25,7 +25,7 @@ from benchmarks.faults.case import INSIDE, WORSE, Stage, stage_config
 from benchmarks.faults.sockets import EPOCH_S, Dvl, report
 from benchmarks.report import Option, Report, note, table
 from benchmarks.soak.storms import STORMS, TICK_S, Place, Shore
-from ssm_graph.cli.online_run import engine_of
+from ssm_graph.cli.online_run import engine_of, pass_over_imports
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator import ONLINE
@@ -155,6 +155,7 @@ def navigate(line: Connection, folder: Path, vehicle: Vehicle, dvl_port: int, cl
         links = (*hub.inputs[1:], *hub.outputs)
         line.send([link.port for link in links])  # type: ignore[attr-defined]
         connections = Connections(Ear(hub, clock, line), hub)
+        pass_over_imports()
         end = Runner(
             RunFolder(folder, vehicle, {}),
             engine_of(vehicle, replace(ONLINE, lag_s=5.0)),

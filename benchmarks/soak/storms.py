@@ -44,14 +44,14 @@ class Caller:
     def send(self, data: bytes) -> None:
         """Send, or have it wait."""
         self._waiting += data
-        with self._answering() as sock:
+        with self._answering():
             while self._waiting:
-                del self._waiting[: sock.send(self._waiting)]
+                del self._waiting[: self._called().send(self._waiting)]
 
     def lines(self) -> list[bytes]:
         """Return the lines that have come."""
-        with self._answering() as sock:
-            while data := sock.recv(CHUNK):
+        with self._answering():
+            while data := self._called().recv(CHUNK):
                 self._rest += data
             self.hang_up()
         *lines, self._rest = self._rest.split(b"\n")
@@ -64,12 +64,17 @@ class Caller:
         self._socket, self._rest = None, b""
         self._waiting.clear()
 
+    def _called(self) -> socket.socket:
+        """Return the connection, made anew where there is none."""
+        if self._socket is None:
+            self._socket = calling(self._port)
+        return self._socket
+
     @contextlib.contextmanager
-    def _answering(self) -> Iterator[socket.socket]:
+    def _answering(self) -> Iterator[None]:
+        """Go on after what is done here where nobody answers; who hung up is called anew."""
         try:
-            if self._socket is None:
-                self._socket = calling(self._port)
-            yield self._socket
+            yield
         except BlockingIOError:
             pass
         except OSError:

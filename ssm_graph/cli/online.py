@@ -45,7 +45,7 @@ examples:
 what is understood and written: docs/live-protocols.md; how to run it: docs/online.md
 """
 INPUTS: Final = {
-    "dvl": "Water Linked DVL-A50 or A125, JSON over TCP port 16171",
+    "dvl": "Water Linked DVL-A50 or A125: JSON (TCP port 16171) or its serial protocol",
     "gnss": "GNSS receiver, NMEA 0183",
     "depth": "pressure sensor, NMEA 0183",
     "heading": "compass or gyrocompass, NMEA 0183 (HDT, THS, PASHR, HDG)",

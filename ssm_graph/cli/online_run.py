@@ -32,6 +32,7 @@ from ssm_graph.live.protocols.json_messages import JsonDecoder
 from ssm_graph.live.protocols.nmea import PRESSURE_SENTENCES, NmeaDecoder, NmeaOptions
 from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
 from ssm_graph.live.run.clock_file import ClockFile
+from ssm_graph.live.run.place_file import PlaceFile
 from ssm_graph.live.run.replay_source import ReplaySource
 from ssm_graph.live.run.run_folder import RunFolder
 from ssm_graph.live.run.runner import Connections, Engine, RunEnd, Runner, RunnerConfig, StopReason
@@ -161,10 +162,17 @@ def _connector(
 ) -> Callable[[int], Connections]:
     def connect(n_messages: int) -> Connections:
         if mission is None:
-            clock = ClockFile(folder)
-            ahead_s = clock.set_by_s(time.time(), boot_s())
-            live = SocketHub(inputs, outputs, set_by_s=ahead_s, note_clock=clock.note)
-            hub = stack.enter_context(live)
+            clock, places = ClockFile(folder), PlaceFile(folder)
+            hub = stack.enter_context(
+                SocketHub(
+                    inputs,
+                    outputs,
+                    set_by_s=clock.set_by_s(time.time(), boot_s()),
+                    note_clock=clock.note,
+                    known=places.known(),
+                    note_places=places.note,
+                )
+            )
             return Connections(hub, hub)
         hub = stack.enter_context(SocketHub(outputs=outputs))
         source = ReplaySource(

@@ -10,8 +10,8 @@ from ssm_graph.base.errors import DataError
 CSV_ENDINGS: Final = (".csv", ".txt", ".tsv", ".dat")
 READ: Final = (
     "a ROS 2 bag (a folder, .mcap or .db3), a ROS 1 .bag, a Blueye X3 log, an ArduPilot log, "
-    "Teledyne PD0, PD4, PD5 or PD6, Nortek AD2CP or Nucleus, Water Linked JSON or a table of its "
-    "reports, NMEA 0183, or tables with  --map"
+    "Teledyne PD0, PD4, PD5 or PD6, Nortek AD2CP or Nucleus, Water Linked JSON, serial lines or "
+    "a table of its reports, NMEA 0183, or tables with  --map"
 )
 _MCAP: Final = b"\x89MCAP0\r\n"
 _REMARKS: Final = 4096

@@ -223,7 +223,9 @@ def test_a_suspicion_ends_with_any_lane_that_agrees() -> None:
 
     (one,) = suspected = judged(0.55, 0.1, (), 100.0)
     assert not one.is_certain
-    assert "noise alone would hardly" in guardian.judge.sentence(lanes, suspected)
+    said = guardian.judge.sentence(lanes, suspected)
+    assert "noise alone would hardly" in said
+    assert said.endswith("mission.toml say so: [gnss] drift_sigma_m")
     (more,) = judged(3.0, 0.1, suspected, 103.0)
     assert more.is_certain
     assert more.since_s == pytest.approx(103.0)

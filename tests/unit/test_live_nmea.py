@@ -113,6 +113,84 @@ def test_gst_after_the_fix_is_waited_for() -> None:
     assert decoder.n_refused == 0
 
 
+def sigmas_of_two(epoch: str, *, tags: bool = False) -> tuple[list[list[float]], list[str]]:
+    """Return the sigmas east of the fixes of each receiver, A north of B, and what was refused.
+
+    In an epoch ``A`` and ``B`` are their positions, ``a`` and ``b`` their GST, of 0.1 and 0.2 m;
+    both receivers are of one talker where tag blocks tell them apart, of one altogether as ``C``.
+    """
+    decoder, found = NmeaDecoder(), list[Message]()
+    talkers = {"A": "GP", "B": "GP" if tags else "GN", "C": "GP"}
+    for k in range(12):
+        utc, data = f"1200{k:02d}.00", b""
+        for one in epoch:
+            talker, east = talkers[one.upper()], {"A": 0.1, "B": 0.2, "C": 0.3}[one.upper()]
+            north = "6327" if one == "A" else "6326"
+            gga = f"{talker}GGA,{utc},{north}.0000,N,01024.0000,E,4,12,0.8,20.50,M,40.25,M,,"
+            gst = f"{talker}GST,{utc},1.1,0.3,0.2,45.0,{east},{east},{east}"
+            tag = f"s:{one.upper()},c:1"
+            block = f"\\{tag}*{checksum(tag)}\\".encode() if tags else b""
+            data += block + sentence(gga if one.isupper() else gst)
+        found += decoder.feed(data, arrival_s=NOON_S + k)
+    found += decoder.take_waiting()
+    fixes = [one for one in found if isinstance(one, Fix)]
+    is_north = [math.degrees(one.lat) > 63.44 for one in fixes]
+    assert len(fixes) == 12 * sum(one.isupper() for one in epoch)
+    pairs = list(zip(fixes, is_north, strict=True))
+    of_each = [[one.sigma_enu[0] for one, at in pairs if at == side] for side in (True, False)]
+    return of_each, decoder.take_refusals()
+
+
+@pytest.mark.parametrize("tags", [False, True], ids=["talkers", "tag blocks"])
+@pytest.mark.parametrize("epoch", ["ABab", "ABba", "AaBb", "BbAa", "abAB", "BAab", "bBAa"])
+def test_of_two_receivers_each_has_its_own_sigmas(epoch: str, *, tags: bool) -> None:
+    """By the second epoch at the latest, in whatever order they speak."""
+    (north, south), refused = sigmas_of_two(epoch, tags=tags)
+    assert set(north[1:]) == {0.1}
+    assert set(south[1:]) == {0.2}
+    assert not refused
+
+
+@pytest.mark.parametrize("epoch", ["ABa", "BAa", "aBA", "BaA"])
+def test_a_receiver_without_sigmas_is_not_given_those_of_another(epoch: str) -> None:
+    """It has those of its HDOP."""
+    (north, south), _ = sigmas_of_two(epoch)
+    assert set(north[1:]) == {0.1}
+    assert set(south[1:]) == {4.0}
+
+
+@pytest.mark.parametrize("epoch", ["ACac", "AaCc", "ACca"])
+def test_of_two_receivers_that_are_not_told_apart_no_sigmas_are_taken(epoch: str) -> None:
+    """Which is said, once."""
+    of_each, (text,) = sigmas_of_two(epoch)
+    assert all(set(sigmas[1:]) == {4.0} for sigmas in of_each)
+    assert "two places of one time" in text
+    assert "tag block" in text
+
+
+def test_a_gns_for_each_system_of_satellites() -> None:
+    """The first has the place; the others are no receivers without a fix."""
+    place = "6326.0000,N,01024.0000,E,AAN,14,0.9,5.5,6.5,,"
+    bodies = (
+        f"GNGNS,120000.00,{place}",
+        "GPGNS,120000.00,,,,,,7,,,,,",
+        "GLGNS,120000.00,,,,,,5,,,,,",
+    )
+    decoder = NmeaDecoder(only=("GNS",))
+    fixes = decoder.feed(b"".join(map(sentence, bodies)) * 3, arrival_s=NOON_S)
+    assert len(fixes) == 3
+    assert decoder.n_without_fix == decoder.n_refused == 0
+    decoder.feed(sentence("GPGNS,120001.00,,,,,,0,,,,,"), arrival_s=NOON_S + 1.0)
+    assert decoder.n_without_fix == 1
+
+
+def test_a_receiver_may_say_its_sigmas_as_another_talker() -> None:
+    """GPGGA and GNGST, as where satellites of several systems are used."""
+    (_, south), refused = sigmas_of_two("Ba")
+    assert set(south[1:]) == {0.1}
+    assert not refused
+
+
 @pytest.mark.parametrize("quality", ["0", "6", "7", "8", ""])
 def test_what_is_no_measured_fix_is_refused(quality: str) -> None:
     """No fix, estimated, typed in, simulated."""

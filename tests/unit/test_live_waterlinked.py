@@ -88,6 +88,41 @@ def recorded() -> list[dict[str, Any]]:
 
 
 @needs_logs
+def test_what_other_writers_make_of_a_report() -> None:
+    """Nothing where a beam or the altitude is not valid, numbers for truth, whole floats."""
+    lacking = with_beams(velocity=None, beam_valid=False)
+    short = report()
+    del short["transducers"][2]
+    table = report(altitude=None)
+    table["time_of_validity"] = float(table["time_of_validity"])
+    for beam in table["transducers"]:
+        beam["beam_valid"] = int(beam["beam_valid"])
+    for k, fields in enumerate((lacking, short, table)):
+        fields["time_of_validity"] += 1000 * (k + 1)
+    pings, refused = read(report(), lacking, short, table)
+    assert not refused
+    missing = [[k for k, v in enumerate(ping.speed) if math.isnan(v)] for ping in pings]
+    assert missing == [[], [1], [2], []]
+    assert read(short)[0] == []  # nothing says yet that it has four
+    assert "expected a number" in read(with_beams(velocity=None))[1][0]
+    assert "true or false" in read(with_beams(beam_valid=2))[1][0]
+
+
+def test_tracking_mode_of_newer_software() -> None:
+    """A velocity in the mode of water track is off the water, whatever its type."""
+    for changes, is_water in (
+        ({"tracking_mode": "bottom"}, False),
+        ({"tracking_mode": "water"}, True),
+        ({"tracking_mode": "water", "type": "velocity_water"}, True),
+        ({"type": "velocity_water"}, True),
+    ):
+        (ping,), refused = read(report(**changes, format="json_v4.1"))
+        assert ping.is_water is is_water
+        assert not refused
+    assert "tracking_mode" in read(report(tracking_mode="dry"))[1][0]
+    assert read({"command": "get_config"}) == ([], [])
+
+
 def test_sign_of_the_instrument(recorded: list[dict[str, Any]]) -> None:
     """Transducer velocities are along beams that point down, out of the transducer."""
     pings, refused = read(*recorded)
@@ -214,7 +249,7 @@ def test_other_reports_are_ignored() -> None:
         (with_beams(id=2), "numbers 0 to 3"),
         (with_beams(velocity="0.1"), "velocity: expected a number"),
         (with_beams(velocity=1e5), "check the unit"),
-        (with_beams(beam_valid=1), "true or false"),
+        (with_beams(beam_valid=2), "true or false"),
         (report(velocity_valid="yes"), "true or false"),
         (report(altitude=[]), "altitude"),
         (report(time_of_validity=1.5), "whole microseconds"),

@@ -5,17 +5,29 @@ from __future__ import annotations
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 
 import numpy as np
+import pytest
 
 from ssm_graph.io.nmea_sentences import checksum
 from ssm_graph.live.protocols.decoder import Decoder
 from ssm_graph.live.protocols.json_messages import JsonDecoder, encode_message
 from ssm_graph.live.protocols.nmea import PREFERRED_S, NmeaDecoder
+from ssm_graph.live.run.place_file import PLACES_NAME, PlaceFile
 from ssm_graph.live.sockets.endpoints import LOOPBACK, Endpoint, Transport
 from ssm_graph.live.sockets.inputs import MAX_SENDERS, TcpServerInput, UdpInput
-from ssm_graph.live.sockets.places import MOST_PLACES, SETTLED, SILENT_S, Place, Places
-from ssm_graph.live.sockets.sockets import InputConfig, SocketHub
+from ssm_graph.live.sockets.places import (
+    LONGEST_INTERVAL_S,
+    MOST_PLACES,
+    SETTLED,
+    SILENT_S,
+    SILENT_TIMES,
+    Known,
+    Place,
+    Places,
+)
+from ssm_graph.live.sockets.sockets import REMEMBER_S, InputConfig, SocketHub
 from ssm_graph.sensors.compass import HeadingReading
 from ssm_graph.sensors.depth import DepthReading
 from ssm_graph.sensors.gnss import Fix
@@ -137,6 +149,32 @@ def test_a_socket_for_every_datagram_keeps_nobody_out() -> None:
     assert len(turns.places._voices[DepthReading]) == MOST_PLACES
 
 
+def test_a_process_that_follows_knows_who_was_heard() -> None:
+    """A stranger that speaks first is refused at once, and gives way where nobody else came."""
+    before, own, other = Turns(), Place("own", "10.0.0.1"), Place("other", "10.0.0.2")
+    assert all(before.hears(own) for _ in range(SETTLED))
+    turns = Turns()
+    turns.places = Places(before.places.known(), turns.now_s)
+    assert not any(turns.hears(other, 0.5) for _ in range(3))
+    assert turns.hears(Place("own, called again", "10.0.0.1"))
+    assert not turns.hears(other)
+    turns = Turns()
+    turns.places = Places(before.places.known(), turns.now_s)
+    assert not turns.hears(other, SILENT_TIMES * LONGEST_INTERVAL_S - 0.1)
+    assert turns.hears(other, 0.2)
+    assert turns.hears(Place("own, called late", "10.0.0.1"))
+    assert not turns.hears(other)
+
+
+@pytest.mark.parametrize("content", [b"", b"[[", b"{}", b'[["Fix", 1, ""], 7]', 3000 * b"["])
+def test_places_that_cannot_be_read_are_none(tmp_path: Path, content: bytes) -> None:
+    """The run goes on as a new one does."""
+    (tmp_path / PLACES_NAME).write_bytes(content)
+    assert PlaceFile(tmp_path).known() == []
+    assert PlaceFile(tmp_path / "nowhere").known() == []
+    assert "cannot be written" in str(PlaceFile(tmp_path / "nowhere").note(()))
+
+
 class Steady:
     """A clock that a test sets."""
 
@@ -192,6 +230,60 @@ def test_a_stranger_at_another_port_feeds_no_depths() -> None:
         receiver.until(lambda: depths(receiver)[-1] == 20.0)
         own.close()
         stray.close()
+
+
+def test_after_a_kill_the_instrument_is_known_by_its_socket(tmp_path: Path) -> None:
+    """A stranger's depths come first, at each of the first three moments, and none is used."""
+    clock, places = Steady(), PlaceFile(tmp_path)
+    own: UdpSender | None = None
+    port = 0
+    for is_again in (False, True):
+        inputs = [InputConfig("depth", Endpoint(Transport.UDP, LOOPBACK, port), JsonDecoder)]
+        with SocketHub(
+            inputs,
+            steady_s=clock,
+            wall_s=lambda: WALL_S + clock.now_s,
+            known=places.known(),
+            note_places=places.note,
+        ) as hub:
+            receiver = Receiver(hub)
+            receiver.poll()
+            (source,) = hub.inputs
+            assert isinstance(source, UdpInput)
+            port = source.port
+            own = own or UdpSender(port)
+            stray = UdpSender(port)
+            for k in range(SETTLED):
+                clock.now_s += 0.1
+                if is_again:
+                    stray.send(depth(clock, 20.0))
+                    receiver.until(lambda n=k: hub.source_status()[0].n_refused == n + 1)  # type: ignore[misc]
+                own.send(depth(clock, 5.0))
+                receiver.until(lambda n=k, r=receiver: len(depths(r)) == n + 1)  # type: ignore[misc]
+            assert set(depths(receiver)) == {5.0}
+            clock.now_s += REMEMBER_S
+            receiver.poll()
+            stray.close()
+    assert [one.kind for one in places.known()] == [DepthReading]
+    assert own is not None
+    own.close()
+
+
+def test_a_place_that_is_called_no_more_keeps_nobody_out() -> None:
+    """A run that is gone on with may call an instrument at another address."""
+    clock = Steady()
+    known = [
+        Known(DepthReading, "dvl, tcp://10.0.0.1:1", f"dvl tcp://10.0.0.1:{k}") for k in (1, 2)
+    ]
+    for port, n_known in ((1, 1), (3, 0)):
+        endpoint = Endpoint(Transport.TCP_CLIENT, "10.0.0.1", port)
+        inputs = [InputConfig("dvl", endpoint, JsonDecoder)]
+        with SocketHub(inputs, steady_s=clock, known=known) as hub:
+            assert len(hub._places.known()) == n_known
+    udp_input = InputConfig("dvl", Endpoint(Transport.UDP, LOOPBACK, 0), JsonDecoder)
+    with SocketHub([udp_input], steady_s=clock, known=known) as hub:
+        assert len(hub._places.known()) == 2
+    assert len(Places(50 * known).known()) == MOST_PLACES
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import random
 from pathlib import Path
@@ -128,6 +129,21 @@ def test_reports_with_a_clock_keep_it(tmp_path: Path) -> None:
     back = "\n".join([lines[3], lines[0]])
     with pytest.raises(DataError, match=r"set back by 1\.5 s"):
         read(tmp_path / "back.json", back.encode())
+
+
+def test_a_clock_that_is_set_amid_a_recording(tmp_path: Path) -> None:
+    """As by NTP, a while after the start: what came before is timed back, and it is said."""
+    found = reports(40, "json_v3")
+    for k, one in enumerate(found):
+        one["time"] = 500.0
+        if k < 30:
+            one["time_of_validity"] -= int((DAY_S - 7.0) * 1e6)  # since the start
+        if k % 2:
+            one["fom"] = math.nan
+    got = read(tmp_path / "dvl.json", "\n".join(map(json.dumps, found)).encode())
+    times_s = [one.time_s for one in got.messages]
+    np.testing.assert_allclose(times_s, DAY_S + 0.5 * np.arange(40), atol=1e-5)
+    assert [note[:10] for note in got.notes] == ["30 reports"]
 
 
 def as_table(rows: list[dict[str, Any]]) -> bytes:

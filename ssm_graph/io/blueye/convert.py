@@ -38,7 +38,7 @@ from ssm_graph.io.blueye.log import GNSS_SENSOR_ID, BlueyeTables, read_blueye_ta
 from ssm_graph.io.mission_folder.assembly import mission_from
 from ssm_graph.mission.mission import Mission
 from ssm_graph.sensors.compass import HeadingLog
-from ssm_graph.sensors.depth import DepthLog
+from ssm_graph.sensors.depth import DepthCalibration, DepthLog
 from ssm_graph.sensors.dvl import DvlLog
 from ssm_graph.sensors.gnss import GnssLog
 from ssm_graph.sensors.imu import ImuLog
@@ -257,7 +257,11 @@ def _depth(tables: BlueyeTables) -> DepthLog:
     table = tables.depth[_is_new(tables.depth[:, 1:])]
     table = table[_strictly_later(table[:, 0])]
     return DepthLog(
-        sigma=x3.DEPTH_SIGMA, time_s=table[:, 0], depth=table[:, 1], lever_arm_b=np.zeros(3)
+        sigma=x3.DEPTH_SIGMA,
+        time_s=table[:, 0],
+        depth=table[:, 1],
+        lever_arm_b=np.zeros(3),
+        calibration=DepthCalibration(drift=x3.DEPTH_DRIFT),
     )
 
 

@@ -71,7 +71,8 @@ def read_pd45(path: Path) -> Recording:
         raise DataError(
             f"{path}: {len(found)} ensembles in {('ship', 'earth')[coordinates - 2]} coordinates, "
             "turned by an attitude that cannot be undone; expected beam or instrument coordinates "
-            "(command EX00xxx or EX01xxx)"
+            "(command EX00xxx or EX01xxx); a Water Linked always states ship coordinates: take its "
+            "JSON, serial lines or PD6 instead"
         )
     messages: list[Message] = []
     last, day_s, known, n_repeats = -np.inf, 0.0, 0, 0

@@ -174,6 +174,8 @@ class LaneBank:
                 self._lasting[name] = slice(end, end + dims[name])
                 end += dims[name]
                 shares += [LASTING.get(suspect, LASTING_OF_OTHERS)] * dims[name]
+        self.undrifting = {SUSPECT_OF[name] for name in self._lasting if name in DRIFTS}
+        """Suspects whose errors would last if the vehicle stated a drift"""
         self._share = np.array(shares)
         """Variance of what lasts, in that of the noise"""
         self._n = sensors.state_dim

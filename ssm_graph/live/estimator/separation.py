@@ -23,6 +23,7 @@ from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.usual import FALSE_ALERTS_PER_H, MISSED_DETECTION
 from ssm_graph.engine.error_state import GYRO_BIAS, POSITION, VELOCITY
+from ssm_graph.graph.aids.gnss import Fixes
 from ssm_graph.live.estimator.lanes import (
     DEPTH,
     DVL,
@@ -43,6 +44,12 @@ SAID: Final = (
     ("gyro bias", "deg/s", 180.0 / np.pi),
 )
 """Name, unit and factor to it"""
+STATED: Final = {
+    DVL: "[dvl] drift_sigma_m_per_s",
+    Fixes.name: "[gnss] drift_sigma_m",
+    DEPTH: "[depth] drift_sigma_m",
+}
+"""What says that the errors of a suspect last, as those of a depth in waves do."""
 TEST_S: Final = 10.0
 """What lanes say changes so slowly, and those of one sensor say so much the same, that of the tests
 of each lane one in so long counts as another one. Of noise as stated, 4 h at navigation and at
@@ -342,7 +349,9 @@ class Judge:
             f"{factor * first.size:.2g} {unit} since {first.since_s:.0f} s, "
         )
         if not first.is_certain:
-            return text + "which noise alone would hardly do"
+            drift = STATED.get(without) if without in self._bank.undrifting else None
+            hint = f"; if its errors last, have mission.toml say so: {drift}" if drift else ""
+            return f"{text}which noise alone would hardly do{hint}"
         return text + "and nothing independent has shown since that the answer is right"
 
     def protection(

@@ -9,10 +9,9 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from decimal import Decimal
 from enum import Enum
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from ssm_graph.base.errors import nearest_hint, printable
-from ssm_graph.live.protocols.framing import LineFramer, ObjectFramer, SentenceFramer
 from ssm_graph.sensors.messages import Message
 
 MAX_REFUSALS: Final = 20
@@ -107,10 +106,21 @@ class Stamper:
         return 0.0 < stamp_s - self._agreed_s < _LONGEST_STANDSTILL_S
 
 
+class Framer(Protocol):
+    """What cuts the bytes of a connection into texts."""
+
+    @property
+    def n_held(self) -> int:
+        """Bytes of what is not complete."""
+
+    def feed(self, data: bytes) -> list[str]:
+        """Return the texts that end in ``data``."""
+
+
 class Decoder(ABC):
     """Texts that a framer cuts out of a stream to messages; the rest is refused."""
 
-    _framer: LineFramer | ObjectFramer | SentenceFramer
+    _framer: Framer
 
     def __init__(self, place: str) -> None:
         """``place`` is how refusals call the source."""

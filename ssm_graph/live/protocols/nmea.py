@@ -7,7 +7,7 @@ import re
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Vector
@@ -21,10 +21,12 @@ from ssm_graph.live.protocols.nmea_fields import (
     POSITIONS,
     DepthSentence,
     Position,
+    is_beside,
     optional_number,
     split_sentence,
     utc_seconds,
 )
+from ssm_graph.live.protocols.nmea_receivers import Pending, Receivers, Speaker, Told
 from ssm_graph.sensors.compass import HeadingReading
 from ssm_graph.sensors.depth import DEEPEST_M, DepthReading
 from ssm_graph.sensors.gnss import Fix
@@ -52,6 +54,7 @@ _FEW_LETTERS: Final = 16
 """Shorter printable pieces are of binary frames that a line end within cuts up."""
 _LIKE_SENTENCE = re.compile(r"[$!]?[A-Z]{2}[A-Z0-9]{2,8},")
 _TAG_BLOCK = re.compile(r"\\([^\\]*)\*([0-9A-Fa-f]{2})\\\Z", re.ASCII)
+_TAG_SOURCE = re.compile(r"(?:\A|,)s:([^,]*)")
 
 PRESSURE_SENTENCES: Final = frozenset(
     {DepthSentence.PRVAT, DepthSentence.PIPS, DepthSentence.PVIPS2}
@@ -94,15 +97,6 @@ class NmeaOptions:
                 f"NmeaOptions.geoid_separation_m: expected a finite number or None, "
                 f"got {self.geoid_separation_m}"
             )
-
-
-class _Pending(NamedTuple):
-    """A position before its sigmas are known."""
-
-    kind: str
-    time_s: float
-    arrival_s: float
-    position: Position
 
 
 class _Preference:
@@ -160,22 +154,14 @@ class NmeaDecoder(Decoder):
             _Preference([kind for kind in kinds if kind in only] or kinds)
             for kinds in (POSITIONS, HEADINGS)
         )
-        self._has_fix = True
-        self._waiting: dict[str, deque[_Pending]] = {}
-        self._pending: _Pending | None = None
-        self._last_utc, self._last_kind = "", ""
-        self._gst: tuple[str, Vector] | None = None
-        self._gst_follows = False
+        self._waiting: dict[str, deque[Pending]] = {}
+        self._receivers = Receivers(self._options.gst_wait_s, self._say_once)
         self._told: set[str] = set()
         self._n_other = 0
         self._idle_s, self._idle_kinds = math.nan, dict[str, None]()
 
     def _overdue(self, arrival_s: float) -> list[Message]:
-        """Return the fix that has waited for its GST long enough."""
-        waited = self._pending and not (
-            0.0 <= arrival_s - self._pending.arrival_s < self._options.gst_wait_s
-        )
-        return self._release(None) if waited else []
+        return self._fixes(self._receivers.overdue(arrival_s))
 
     def _decode(self, text: str, arrival_s: float) -> list[Message]:
         begin = text.rfind("$")
@@ -185,25 +171,30 @@ class NmeaDecoder(Decoder):
                 self._pass_over(text)
             return []
         lead = text[:begin].rstrip("$")
+        tag = _TAG_BLOCK.search(lead)
         if lead:
-            self._pass_over(self._without_tag(lead))
+            self._pass_over(self._without_tag(lead, tag))
         name, *fields = split_sentence(text[begin + 1 :])
         self._n_other = 0
         self._told.discard("other")
         kind = name if name.startswith("P") else name[-3:]
-        messages = self._read(kind, fields, arrival_s, is_own=name.startswith(TALKER))
+        source = tag and _TAG_SOURCE.search(tag[1])
+        speaker = Speaker(source[1] if source else "", name.removesuffix(kind))
+        messages = self._read(speaker, kind, fields, arrival_s)
         self._watch(kind, arrival_s, is_read=messages is not None)
         return messages or []
 
     def _read(
-        self, kind: str, fields: list[str], arrival_s: float, *, is_own: bool
+        self, speaker: Speaker, kind: str, fields: list[str], arrival_s: float
     ) -> list[Message] | None:
         """Return the messages of a sentence, None for one that is not looked at."""
+        if is_beside(kind, fields):
+            return []
         if kind in POSITIONS:
-            return self._on_position(kind, fields, arrival_s)
+            return self._on_position(speaker, kind, fields, arrival_s)
         if kind == "GST":
-            return self._on_gst(fields)
-        if kind in HEADINGS and not is_own:
+            return self._on_gst(speaker, fields, arrival_s)
+        if kind in HEADINGS and speaker.talker != TALKER:
             return self._on_heading(kind, fields, arrival_s)
         if kind in DEPTHS and DepthSentence[kind] in self._options.depth_sentences:
             below_surface = DEPTHS[kind](fields, self._options)
@@ -212,9 +203,8 @@ class NmeaDecoder(Decoder):
             return [DepthReading(self._stamper.stamp(None, arrival_s), depth)]
         return None
 
-    def _without_tag(self, lead: str) -> str:
+    def _without_tag(self, lead: str, found: re.Match[str] | None) -> str:
         """Return what stands before a sentence without a tag block."""
-        found = _TAG_BLOCK.search(lead)
         if not found:
             return lead
         if found[1].isascii() and checksum(found[1]) != found[2].upper():
@@ -261,58 +251,52 @@ class NmeaDecoder(Decoder):
             self._told.add(what)
             self._refuse(text)
 
-    def _on_position(self, kind: str, fields: list[str], arrival_s: float) -> list[Message]:
+    def _on_position(
+        self, speaker: Speaker, kind: str, fields: list[str], arrival_s: float
+    ) -> list[Message]:
         if not self._positions.takes(kind, arrival_s):
-            self._have_wait(kind, fields, arrival_s)
+            self._have_wait(speaker, kind, fields, arrival_s)
             return []
-        before = self._release(None) + self._waited(kind)
+        before = self._fixes([*self._receivers.begin(speaker, arrival_s), *self._waited(kind)])
         try:
-            pending = self._position(kind, fields, arrival_s)
+            place = POSITIONS[kind](fields)
+            is_lost = self._receivers.loses_fix(speaker, has_fix=place is not None)
+            if place is not None:
+                time_s = self._stamper.stamp(utc_seconds(place.utc, arrival_s), arrival_s)
+                pending = Pending(speaker, kind, time_s, arrival_s, place)
+                return before + self._fixes(self._receivers.take(pending))
+            self.n_without_fix += 1
+            if is_lost:
+                self._refuse(f"{kind}: the receiver has no fix; said once until it has one")
         except RefusedError as error:
             self._refuse(f"{kind}: {error}")
-            return before
-        if pending is None:
-            return before
-        utc = pending.position.utc
-        if utc and utc == self._last_utc and kind != self._last_kind:
-            return before  # when a better sentence begins to be read, amid an epoch
-        self._pending, self._last_utc, self._last_kind = pending, utc, kind
-        if self._gst is not None and self._gst[0] == utc and utc:
-            self._gst_follows = False
-            return before + self._release(self._gst[1])
-        return before + ([] if self._gst_follows else self._release(None))
+        return before
 
-    def _have_wait(self, kind: str, fields: list[str], arrival_s: float) -> None:
+    def _have_wait(self, speaker: Speaker, kind: str, fields: list[str], arrival_s: float) -> None:
         """Keep a position while it is not known whether a sentence that says more comes."""
         try:
             place = POSITIONS[kind](fields) if self._positions.may_take(kind) else None
-            if place is not None and place.utc != self._last_utc:
+            if place is not None and not self._receivers.has_said(place.utc):
                 time_s = self._stamper.stamp(utc_seconds(place.utc, arrival_s), arrival_s)
                 waiting = self._waiting.setdefault(kind, deque(maxlen=_MOST_WAITING))
-                waiting.append(_Pending(kind, time_s, arrival_s, place))
+                waiting.append(Pending(speaker, kind, time_s, arrival_s, place))
         except RefusedError:  # which is told where it is read
             return
 
-    def _waited(self, kind: str) -> list[Message]:
-        """Return the fixes of a sentence that is read from now on; the others are not needed."""
-        waiting, fixes = self._waiting.get(kind, ()), list[Message]()
-        for self._pending in waiting:
-            fixes += self._release(None)
-        self._waiting.clear()
-        return fixes
+    def _waited(self, kind: str) -> list[Told]:
+        """Return positions of a sentence that is read from now on; the others are not needed."""
+        waiting = self._waiting.get(kind, ())
+        self._waiting = {}
+        return [(pending, None) for pending in waiting]
 
-    def _on_gst(self, fields: list[str]) -> list[Message]:
+    def _on_gst(self, speaker: Speaker, fields: list[str], arrival_s: float) -> list[Message]:
         if len(fields) < 8:
             raise RefusedError(f"GST: expected 8 fields, got {len(fields)}")
         utc = fields[0]
         north, east, up = (optional_number(field, "GST") for field in fields[5:8])
         if not utc or not east or not north or not up or min(east, north, up) <= 0.0:
             return []  # receivers without a fix write empty fields or zeros
-        self._gst = utc, (east, north, up)
-        self._gst_follows = utc == self._last_utc
-        if self._pending is not None and self._pending.position.utc == utc:
-            return self._release(self._gst[1])
-        return []
+        return self._fixes(self._receivers.hear(speaker, utc, (east, north, up), arrival_s))
 
     def _on_heading(self, kind: str, fields: list[str], arrival_s: float) -> list[Message]:
         found = HEADINGS[kind](fields)
@@ -328,43 +312,41 @@ class NmeaDecoder(Decoder):
     def take_waiting(self) -> list[Message]:
         """Return them for good."""
         held = self._held()
-        self._pending = None
-        self._waiting.clear()
-        return [fix for self._pending in held for fix in self._release(None)]
+        self._receivers.clear()
+        self._waiting = {}
+        return self._fixes([(pending, None) for pending in held])
 
-    def _held(self) -> list[_Pending]:
+    def _held(self) -> list[Pending]:
         """Return positions that wait, one of each moment: of the sentence that says most."""
-        found = {} if self._pending is None else {self._pending.position.utc: self._pending}
-        for kind in POSITIONS:
-            for one in self._waiting.get(kind, ()):
-                found.setdefault(one.position.utc, one)
-        return sorted(found.values(), key=lambda one: one.time_s)
+        found: list[Pending] = []
+        for some in (self._receivers.waiting(), *map(self._waiting.get, POSITIONS)):
+            said = {one.position.utc for one in found} - {""}
+            found += [one for one in some or () if one.position.utc not in said]
+        return sorted(found, key=lambda one: one.time_s)
 
-    def _release(self, sigma_enu: Vector | None) -> list[Message]:
-        """Return the fix that waits, by HDOP where its sigmas are not known."""
-        pending, self._pending = self._pending, None
-        if pending is None:
-            return []
-        place = pending.position
-        if sigma_enu is None:
-            self._gst_follows = False
-            if not place.hdop or place.hdop < 0.0:
-                self._say_once("hdop", f"{pending.kind}: no HDOP, no GST: {ASSUMED_HDOP} is taken")
-        if place.altitude is None:
-            self._say_once("height", f"{pending.kind}: no height: the water's surface, to 100 m")
-        elif self._separation(place) is None:
-            self._say_once(
-                "geoid",
-                f"{pending.kind}: geoid separation is empty: heights count to 100 m; set "
-                "NmeaOptions.geoid_separation_m (--geoid-separation)",
-            )
-        return [self._fix(pending, sigma_enu)]
+    def _fixes(self, told: Iterable[Told]) -> list[Message]:
+        """Return fixes, by HDOP without sigmas; say what is taken where a sentence lacks it."""
+        fixes: list[Message] = []
+        for pending, sigma_enu in told:
+            kind, place = pending.kind, pending.position
+            if sigma_enu is None and (not place.hdop or place.hdop < 0.0):
+                self._say_once("hdop", f"{kind}: no HDOP, no GST: {ASSUMED_HDOP} is taken")
+            if place.altitude is None:
+                self._say_once("height", f"{kind}: no height: the water's surface, to 100 m")
+            elif self._separation(place) is None:
+                self._say_once(
+                    "geoid",
+                    f"{kind}: geoid separation is empty: heights count to 100 m; set "
+                    "NmeaOptions.geoid_separation_m (--geoid-separation)",
+                )
+            fixes.append(self._fix(pending, sigma_enu))
+        return fixes
 
     def _separation(self, place: Position) -> float | None:
         own = place.separation
         return self._options.geoid_separation_m if own is None else own
 
-    def _fix(self, pending: _Pending, sigma_enu: Vector | None) -> Fix:
+    def _fix(self, pending: Pending, sigma_enu: Vector | None) -> Fix:
         place = pending.position
         if sigma_enu is None:
             hdop = place.hdop if place.hdop and place.hdop > 0.0 else ASSUMED_HDOP
@@ -378,16 +360,3 @@ class NmeaDecoder(Decoder):
         if place.altitude is None or separation is None:
             sigma_enu = (*sigma_enu[:2], max(sigma_enu[2], HEIGHT_SIGMA_M))
         return Fix(pending.time_s, place.lat, place.lon, height, sigma_enu)
-
-    def _position(self, kind: str, fields: list[str], arrival_s: float) -> _Pending | None:
-        """Return a position, None where the receiver has none."""
-        place = POSITIONS[kind](fields)
-        if place is None:
-            self.n_without_fix += 1
-            if self._has_fix:
-                self._refuse(f"{kind}: the receiver has no fix; said once until it has one")
-            self._has_fix = False
-            return None
-        self._has_fix = True
-        time_s = self._stamper.stamp(utc_seconds(place.utc, arrival_s), arrival_s)
-        return _Pending(kind, time_s, arrival_s, place)

@@ -80,6 +80,16 @@ def _gns(fields: list[str]) -> Position | None:
     return _with_height(fields, separation=fields[9]) if _is_measured(fields[5]) else None
 
 
+def is_beside(kind: str, fields: list[str]) -> bool:
+    """Return whether a GNS says of one system of satellites only how many count beside another's.
+
+    It has neither a place nor a mode: a receiver without a fix states a mode.
+    """
+    if kind != "GNS" or len(fields) < 7 or fields[1] or fields[5]:
+        return False
+    return fields[6].isdecimal() and fields[6].isascii() and int(fields[6][:3]) > 0
+
+
 def _with_height(fields: list[str], *, separation: str) -> Position:
     """Return a position of GGA or GNS, which begin alike."""
     return Position(

@@ -1,4 +1,4 @@
-"""Reports of the Water Linked DVL-A50 and A125 (JSON over TCP, port 16171) as pings.
+"""Reports of the Water Linked DVL-A50 and A125 (JSON over TCP, port 16171; serial) as pings.
 
 Sign. Over the 269 reports with four beams and a valid velocity of a recorded A50 (December 2021),
 least squares gives the transducers' velocities from (vx, vy, vz), z down, as::
@@ -43,7 +43,8 @@ from ssm_graph.live.protocols.decoder import (
     require,
     shown,
 )
-from ssm_graph.live.protocols.framing import MAX_LENGTH, ObjectFramer
+from ssm_graph.live.protocols.framing import MAX_LENGTH
+from ssm_graph.live.protocols.waterlinked_serial import ReportFramer
 from ssm_graph.sensors.compass import HeadingReading
 from ssm_graph.sensors.dvl import Ping
 from ssm_graph.sensors.dvl_readings import LARGEST_SPEED
@@ -52,11 +53,13 @@ from ssm_graph.sensors.messages import Message
 PLACE: Final = "water linked"
 _TRACKS: Final = {"velocity": False, "velocity_water": True}
 """Types of reports with beams, and whether they are off the water, as software 2.7 has them."""
+_MODES: Final = {"bottom": False, "water": True}
+"""The tracking mode that software 2.7 states besides."""
 _DEAD_RECKONING: Final = "position_local"
 _IGNORED: Final = frozenset({"response"})
 """Types of the protocol that say nothing of the motion."""
-_NUMBERS: Final = ([0, 1, 2], [0, 1, 2, 3])
-"""Of the transducers of an instrument."""
+_MOST, _FEWEST = 4, 3
+"""Transducers of an instrument."""
 _GROUND_ALONE: Final = ("json_v1", "json_v2", "json_v2.1", "json_v3", "json_v3.1")
 """Formats of software before 2.7, which knew no water track: the first has no type, and what passes
 reports on may leave it out."""
@@ -71,7 +74,7 @@ class BeamRule(Enum):
 
 
 class WaterLinkedDecoder(Decoder):
-    """Velocity reports to pings, in any layout: one a line, spread over lines, back to back.
+    """Velocity reports to pings, as JSON in any layout, or as lines of the serial protocol.
 
     A report without a beam that counts is a ping of missing beams. The same report again (by
     ``time_of_validity``, or by content where there is none) is dropped and counted.
@@ -99,23 +102,26 @@ class WaterLinkedDecoder(Decoder):
         super().__init__(PLACE)
         self.n_repeats = 0
         """How many reports came again and were dropped."""
-        self._framer = ObjectFramer(self._refuse, max_length=max_length)
+        self._framer = ReportFramer(self._refuse, max_length=max_length)
         self._stamper, self._yaw_stamper = (
             Stamper(clock, max_clock_error_s=max_clock_error_s, refusals=self._refusals, place=one)
             for one in (PLACE, f"{PLACE} {_DEAD_RECKONING}")
         )
         self._beam_rule, self._reads_heading = beam_rule, heading
         self._last: dict[str, dict[str, Any]] = {}
+        self._n_beams = _FEWEST
 
     def _decode(self, text: str, arrival_s: float) -> list[Message]:
         report = parse_object(text)
+        if "command" in report:  # what somebody asked of it, in a recording of both sides
+            return []
         kind = "velocity" if _is_without_type(report) else require(report, "type")
         if not isinstance(kind, str) or kind not in {*_TRACKS, _DEAD_RECKONING, *_IGNORED}:
             raise RefusedError(f"expected a report of type 'velocity', got {shown(kind)}")
         if kind in _IGNORED or (kind == _DEAD_RECKONING and not self._reads_heading):
             return []
         message = (
-            self._ping(report, arrival_s, is_water=_TRACKS[kind])
+            self._ping(report, arrival_s, is_water=_is_water(report, kind))
             if kind in _TRACKS
             else self._heading(report, arrival_s)
         )
@@ -126,10 +132,11 @@ class WaterLinkedDecoder(Decoder):
         return [message] if message is not None else []
 
     def _ping(self, report: dict[str, Any], arrival_s: float, *, is_water: bool) -> Ping:
-        beams = _transducers(report)
+        beams = _transducers(report, self._n_beams)
+        self._n_beams = max(self._n_beams, len(beams))
         counts = self._counts(report, beams)
         if not is_water:
-            altitude_m = number(report.get("altitude", -1.0), key="altitude")
+            altitude_m = _altitude(report)
             self.altitude_m = altitude_m if altitude_m > 0.0 else math.nan
         speed = tuple(
             float(x["velocity"]) if counts and x["beam_valid"] else math.nan for x in beams
@@ -154,7 +161,7 @@ class WaterLinkedDecoder(Decoder):
     def _counts(self, report: dict[str, Any], beams: list[dict[str, Any]]) -> bool:
         """Return whether the valid beams of a report are to be believed."""
         is_valid = flag(report, "velocity_valid")
-        has_altitude = number(report.get("altitude", -1.0), key="altitude") > 0.0
+        has_altitude = _altitude(report) > 0.0
         if is_valid:
             return True
         if len({beam["velocity"] for beam in beams}) == 1:
@@ -164,6 +171,14 @@ class WaterLinkedDecoder(Decoder):
         return self._beam_rule is BeamRule.EACH
 
 
+def _is_water(report: dict[str, Any], kind: str) -> bool:
+    """Return whether a report is off the water, by its type or the mode of the instrument."""
+    mode = report.get("tracking_mode", "bottom")
+    if not isinstance(mode, str) or mode not in _MODES:
+        raise RefusedError(f"tracking_mode: expected bottom or water, got {shown(mode)}")
+    return _TRACKS[kind] or _MODES[mode]
+
+
 def _is_without_type(report: dict[str, Any]) -> bool:
     """Return whether a report says by what it holds that it is of a velocity off the ground."""
     if "type" in report or not {"transducers", "velocity_valid"} <= report.keys():
@@ -171,23 +186,47 @@ def _is_without_type(report: dict[str, Any]) -> bool:
     return report.get("format", "json_v1") in _GROUND_ALONE
 
 
-def _transducers(report: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the transducers in the order of their numbers, checked."""
+def _transducers(report: dict[str, Any], n_known: int) -> list[dict[str, Any]]:
+    """Return the transducers in the order of their numbers, checked.
+
+    One of which nothing is said is not valid, where the instrument is known to have it.
+    """
     found = require(report, "transducers")
     if not isinstance(found, list) or not all(isinstance(beam, dict) for beam in found):
         raise RefusedError(
             f"transducers: expected a list of 3 or 4 objects, got {shown(str(found))}"
         )
     numbers = [require(beam, "id") for beam in found]
-    if any(type(n) is not int for n in numbers) or sorted(numbers) not in _NUMBERS:
+    are_sound = all(type(n) is int and 0 <= n < _MOST for n in numbers)
+    is_of_three = are_sound and sorted(numbers) == [*range(_FEWEST)]
+    n_beams = _FEWEST if is_of_three else _MOST
+    is_known = len(numbers) == _MOST or n_known == _MOST or is_of_three
+    if not are_sound or len({*numbers}) < len(numbers) or not is_known:
         raise RefusedError(
             f"transducers: expected the numbers 0 to 3, or 0 to 2, got {shown(str(numbers))}"
         )
-    beams = sorted(found, key=lambda beam: int(beam["id"]))
-    for beam in beams:
-        largest = LARGEST_SPEED if flag(beam, "beam_valid") else math.inf
-        number(require(beam, "velocity"), key="velocity", low=-largest, high=largest)
-    return beams
+    said = {int(beam["id"]): beam for beam in found}
+    beams = [said.get(k, {"velocity": 0.0, "beam_valid": False}) for k in range(n_beams)]
+    return [_checked(beam) for beam in beams]
+
+
+def _checked(beam: dict[str, Any]) -> dict[str, Any]:
+    """Return a transducer with a number for its velocity; nothing may stand for one not valid."""
+    is_valid = require(beam, "beam_valid")
+    if not isinstance(is_valid, bool) and is_valid not in (0, 1):  # as tables and databases write
+        raise RefusedError(f"beam_valid: expected true or false, got {shown(is_valid)}")
+    velocity = require(beam, "velocity")
+    if velocity is None and not is_valid:
+        velocity = 0.0
+    largest = LARGEST_SPEED if is_valid else math.inf
+    speed = number(velocity, key="velocity", low=-largest, high=largest)
+    return {"velocity": speed, "beam_valid": bool(is_valid)}
+
+
+def _altitude(report: dict[str, Any]) -> float:
+    """Return the altitude, m; -1 where there is none."""
+    altitude = report.get("altitude")
+    return -1.0 if altitude is None else number(altitude, key="altitude")
 
 
 def _time_of_validity(report: dict[str, Any]) -> float | None:
@@ -195,6 +234,7 @@ def _time_of_validity(report: dict[str, Any]) -> float | None:
     if "time_of_validity" not in report:
         return None
     stamp = report["time_of_validity"]
-    if type(stamp) is not int:
+    is_whole = type(stamp) is int or (isinstance(stamp, float) and stamp.is_integer())
+    if not is_whole:  # tables make floats of whole numbers
         raise RefusedError(f"time_of_validity: expected whole microseconds, got {shown(stamp)}")
-    return stamp / 1e6
+    return float(stamp) / 1e6

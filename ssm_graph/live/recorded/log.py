@@ -32,7 +32,7 @@ from ssm_graph.io.teledyne.ensembles import is_pd0
 from ssm_graph.io.teledyne.pd0 import read_pd0
 from ssm_graph.io.teledyne.short_formats import is_pd6, is_pd45, read_pd6, read_pd45
 from ssm_graph.live.protocols.decoder import RefusedError, parse_object
-from ssm_graph.live.protocols.framing import ObjectFramer, SentenceFramer
+from ssm_graph.live.protocols.framing import MAX_LENGTH, SentenceFramer
 from ssm_graph.live.protocols.nmea import MAX_SENTENCE, PREFERRED_S, NmeaDecoder, NmeaOptions
 from ssm_graph.live.protocols.nmea_fields import (
     DAY_S,
@@ -42,6 +42,7 @@ from ssm_graph.live.protocols.nmea_fields import (
     utc_seconds,
 )
 from ssm_graph.live.protocols.waterlinked import WaterLinkedDecoder
+from ssm_graph.live.protocols.waterlinked_serial import SERIAL, ReportFramer
 from ssm_graph.live.recorded.water_linked_table import SIGN, rows_of
 from ssm_graph.sensors.compass import HeadingReading
 from ssm_graph.sensors.depth import DepthReading
@@ -58,8 +59,16 @@ _SHORTEST_S: Final = 1e-3
 """From one report to the next."""
 _ANY_CLOCK_S: Final = 1e12
 _SENTENCE = re.compile(rb"[$!][A-Z]{2}[A-Z0-9]{2,},")
-_PYTHON: Final = {b"'": b'"', b"True": b"true", b"False": b"false", b"None": b"null"}
-_OF_PYTHON = re.compile(rb"'|\b(?:True|False|None)\b")
+_PYTHON: Final = {
+    b"'": b'"',
+    b"True": b"true",
+    b"False": b"false",
+    b"None": b"null",
+    b"nan": b"null",
+}
+_OF_PYTHON = re.compile(rb"'|\b(?:True|False|None|nan)\b")
+_NO_NUMBER = re.compile(rb"(?<=[:\[,\s])(?:NaN|-?Infinity)(?=[\s,}\]])")
+"""What programs write into JSON that has no words for them"""
 _BINARY: Final[Sequence[tuple[Callable[[bytes], bool], Callable[[Path], Any]]]] = (
     (is_pd0, read_pd0),
     (is_nortek, read_nortek),
@@ -109,6 +118,8 @@ def read_recorded(log: Path, options: NmeaOptions | None = None) -> Recorded | N
         found = _water_linked(_OF_PYTHON.sub(lambda found: _PYTHON[found[0]], data))
     elif b'"transducers"' in head or (head.lstrip()[:1] in (b"{", b"[") and b'"' in head):
         found = _water_linked(data)
+    elif SERIAL.search(head):
+        found = _water_linked(data, "Water Linked, serial protocol")
     elif SIGN in head.partition(b"\n")[0]:
         found = _water_linked_table(data)
     elif _SENTENCE.search(head):
@@ -207,34 +218,42 @@ def _said(refusals: list[str], n_refused: int) -> list[str]:
     return [*shown, *((f"{more} more were refused",) if more > 0 else ())]
 
 
-def _water_linked(data: bytes) -> Recorded:
+def _water_linked(data: bytes, name: str = "Water Linked JSON") -> Recorded:
     decoder = WaterLinkedDecoder(heading=True, max_clock_error_s=_ANY_CLOCK_S)
     torn: list[str] = []
-    framer = ObjectFramer(torn.append)
+    framer = ReportFramer(torn.append, max_length=MAX_LENGTH)
     messages: list[Message] = []
     time_s, last_s, before, has_clock = 0.0, -math.inf, dict[str, Any](), True
-    for text in told(framer.feed(data + b"\n"), len(data), size=len):
+    n_unset = 0
+    for text in told(framer.feed(_NO_NUMBER.sub(b"null", data) + b"\n"), len(data), size=len):
         report = _object(text)
-        stated_s = _unix(report, time_s)
+        stated_s = _stated(report, time_s)
         if messages and time_s < UNIX_FROM_S <= stated_s:  # what came before gets that clock too
-            messages = [replace(one, time_s=one.time_s + stated_s - time_s) for one in messages]
+            begin_s = stated_s - (_between(report) if "time_of_validity" in report else 0.0)
+            messages = [replace(one, time_s=one.time_s + begin_s - time_s) for one in messages]
+            n_unset = len(messages) if has_clock else 0
         time_s = stated_s
         if "time_of_validity" not in report and "transducers" in report:
             has_clock = False
             if report != before:
-                time_s = max(time_s + 1e-3 * _number(report.get("time")), last_s + _SHORTEST_S)
+                time_s = max(time_s + _between(report), last_s + _SHORTEST_S)
             before, last_s = report, max(time_s, last_s)
         messages += decoder.feed(text.encode() + b"\n", arrival_s=time_s)
     notes = _said([*torn, *decoder.take_refusals()], len(torn) + decoder.n_refused)
     if decoder.n_repeats:
         notes.append(f"{decoder.n_repeats} reports came again and were left out.")
+    if n_unset:
+        notes.append(
+            f"{n_unset} reports came before the instrument's clock was set: they are timed back "
+            "from the first after it."
+        )
     if not has_clock:
         notes.append(
             "Reports before format json_v3 have no clock: time_s is the sum of the times between "
             "them, from the first one on or from the stamps of the dead reckoning beside them; add "
             "what makes it the vehicle's."
         )
-    return Recorded(_about("Water Linked JSON", messages), tuple(messages), tuple(notes))
+    return Recorded(_about(name, messages), tuple(messages), tuple(notes))
 
 
 def _water_linked_table(data: bytes) -> Recorded:
@@ -266,17 +285,25 @@ def _object(text: str) -> dict[str, Any]:
         return {}  # which the decoder refuses and tells
 
 
-def _number(value: Any) -> float:
+def _between(report: Mapping[str, Any]) -> float:
+    """Return the time since the report before, s; 0 where it is not said."""
+    value: Any = report.get("time")
     is_sound = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return float(value) if is_sound and 0.0 <= value < 1e6 else 0.0
+    return 1e-3 * float(value) if is_sound and 0.0 <= value < 1e6 else 0.0
 
 
-def _unix(report: Mapping[str, Any], time_s: float) -> float:
-    """Return the Unix time that a report states, or the one before."""
+def _stated(report: Mapping[str, Any], time_s: float) -> float:
+    """Return the time that a report states, s, or the one before.
+
+    Unix time; of a centre of ping also that of a clock that was never set, until another one was.
+    """
     for key, unit in (("time_of_validity", 1e-6), ("ts", 1.0)):
         value = report.get(key)
-        if isinstance(value, (int, float)) and value * unit > UNIX_FROM_S:
-            return float(value) * unit
+        if isinstance(value, (int, float)) and not isinstance(value, bool):
+            stated_s = float(value) * unit
+            is_of_ping = key == "time_of_validity" and stated_s > 0.0 and time_s < UNIX_FROM_S
+            if stated_s > UNIX_FROM_S or is_of_ping:
+                return stated_s
     return time_s
 
 

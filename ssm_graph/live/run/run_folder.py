@@ -8,6 +8,7 @@
 ``events.jsonl``       what happened, a line of JSON each
 ``checkpoint.npz``     the estimator, and the sizes of the files above at that moment
 ``clock.csv``          by how much the vehicle's clock was set (`clock_file.ClockFile`)
+``places.json``        where each instrument was heard (`place_file.PlaceFile`)
 ``summary.json``       how it ended; not there while it goes on
 ``run.json``           settings; a run is gone on with the same ones only
 ``lock``               held by the process that writes here

@@ -119,10 +119,11 @@ class Feed:
 
     def channel(self, now: Now, place: Place | None = None) -> Channel:
         """Return the begin of a connection; of one that others begin, from where."""
-        return Channel(self._make_decoder(), now, place or self.place(self.address))
+        place = place or self.place(self.address, self.address)
+        return Channel(self._make_decoder(), now, place)
 
     def place(self, where: str, host: str = "") -> Place:
-        """Return a place of this source; of one that others begin, with their host."""
+        """Return a place of this source, with the host at its other end."""
         return Place(f"{self.name}, {where}", host and f"{self.name} {host}")
 
     def take(self, channel: Channel, data: bytes, now: Now) -> list[Message]:

@@ -4,11 +4,13 @@ A place is a connection, or a sender of datagrams. Of several that send messages
 that was heard first counts; the others are refused, which is told, and one of them is heard once
 the first has fallen silent. It gives way where the first is back. What a new one of the same host
 sends waits at first: a client may have called again before what it sent by its last call is read.
+A process that goes on with the run of another one knows who kept others out there.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
@@ -38,7 +40,7 @@ class Place:
     name: str
     """For people."""
     host: str = ""
-    """Of a client that called, with the source: another call from there takes its place."""
+    """Of who calls or is called, with the source: another call from there takes its place."""
     is_left: bool = False
     """Whether the connection is gone."""
 
@@ -49,6 +51,14 @@ class Place:
     def is_of_host(self, other: Place) -> bool:
         """Return whether another one may be the same client."""
         return bool(self.host) and self.host == other.host
+
+
+class Known(NamedTuple):
+    """A place that keeps others of its kind of message out."""
+
+    kind: type[Message]
+    name: str
+    host: str
 
 
 class Heard(NamedTuple):
@@ -131,10 +141,27 @@ class _Voice:
 
 
 class Places:
-    """All places of a run, by the kind of message, in the order in which they were heard first."""
+    """All places of a run, by the kind of message, in the order in which they were heard first.
 
-    def __init__(self) -> None:
+    ``known`` kept others out in an earlier process of the run, and do so from ``steady_s`` on, as
+    long as any instrument is waited for.
+    """
+
+    def __init__(self, known: Iterable[Known] = (), steady_s: float = -math.inf) -> None:
         self._voices: dict[type[Message], list[_Voice]] = {}
+        for kind, name, host in known:
+            voice = _Voice(Place(name, host, is_left=True), steady_s, LONGEST_INTERVAL_S, SETTLED)
+            voices = self._voices.setdefault(kind, [])
+            voices += [voice] if len(voices) < MOST_PLACES else []
+
+    def known(self) -> tuple[Known, ...]:
+        """Return the places that keep others out, by which a process that follows knows them."""
+        return tuple(
+            Known(kind, voice.place.name, voice.place.host)
+            for kind, voices in self._voices.items()
+            for voice in voices
+            if voice.is_settled and voice.place.host
+        )
 
     def hear(self, place: Place, message: Message, steady_s: float) -> Heard:
         """Return what may pass now that a message has come from a place, and what is refused.

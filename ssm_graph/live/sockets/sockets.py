@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import selectors
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, Self
 
@@ -14,7 +15,7 @@ from ssm_graph.live.sockets.endpoints import Endpoint, Transport
 from ssm_graph.live.sockets.feed import Feed, Limits
 from ssm_graph.live.sockets.inputs import Input, TcpClientInput, TcpServerInput, UdpInput
 from ssm_graph.live.sockets.outputs import Output, OutputFormat, TcpServerOutput, UdpOutput
-from ssm_graph.live.sockets.places import Places
+from ssm_graph.live.sockets.places import Known, Places
 from ssm_graph.live.sockets.serial_port import SerialInput
 from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.navigation import Event, Severity
@@ -23,6 +24,8 @@ from ssm_graph.sensors.messages import Message, Readings
 
 STANDSTILL_S: Final = 2.0
 """Nobody has looked after the sockets for longer: the process was stopped, or something hung."""
+REMEMBER_S: Final = 1.0
+"""From one time that it is remembered where instruments are heard to the next, if that changed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +56,9 @@ class SocketHub:
     in the time of the run, which goes on where the vehicle's clock is set; ``set_by_s`` is by how
     much that was set in earlier processes of the run. ``note_clock`` remembers that: it is told the
     time of the run, how far the vehicle's clock is ahead of it, and the steady clock, all in s, at
-    the begin and where the clock was set, and returns why it could not.
+    the begin and where the clock was set, and returns why it could not. ``known`` are places that
+    kept others out in earlier processes of the run; ``note_places`` remembers those of this one,
+    and returns why it could not.
     """
 
     is_finished = False
@@ -68,12 +73,16 @@ class SocketHub:
         steady_s: Callable[[], float] = boot_s,
         set_by_s: float = 0.0,
         note_clock: Callable[[float, float, float], str | None] | None = None,
+        known: Iterable[Known] = (),
+        note_places: Callable[[Iterable[Known]], str | None] | None = None,
     ) -> None:
         self._steady_s = steady_s
         self._begin_s = self._polled_s = steady_s()
         self._clock = RunClock(wall_s, steady_s, set_by_s)
         self._note_clock = note_clock
-        self._stamps, self._places = StampClocks(self._clock), Places()
+        self._stamps = StampClocks(self._clock)
+        self._places = Places(_still_there(known, inputs), self._begin_s)
+        self._note_places, self._noted, self._noted_s = note_places, self._places.known(), -math.inf
         self._events = EventLog(lambda: self.time_s, steady_s)
         self._selector = selectors.DefaultSelector()
         self.inputs: list[Input] = []
@@ -139,6 +148,7 @@ class SocketHub:
         for link in self._links:
             with self._events.surviving(link.name, "socket_failed"):
                 messages += link.tick(now) or []  # outputs have none
+        self._keep_places(now)
         return messages
 
     def waiting(self) -> list[Readings]:
@@ -168,6 +178,16 @@ class SocketHub:
         if self._note_clock is not None:
             set_by_s = self._clock.set_by_s
             problem = self._note_clock(now.wall_s - set_by_s, set_by_s, now.steady_s)
+            if problem is not None:
+                self._events.note("disk", "disk", problem, Severity.ERROR)
+
+    def _keep_places(self, now: Now) -> None:
+        """Have it remembered where instruments are heard, where that has changed."""
+        if self._note_places is None or now.steady_s - self._noted_s < REMEMBER_S:
+            return
+        self._noted_s, known = now.steady_s, self._places.known()
+        if known != self._noted:
+            self._noted, problem = known, self._note_places(known)
             if problem is not None:
                 self._events.note("disk", "disk", problem, Severity.ERROR)
 
@@ -250,3 +270,11 @@ class SocketHub:
         if config.endpoint.transport is Transport.UDP:
             return UdpOutput(config.form, config.endpoint, self._events)
         return TcpServerOutput(config.form, config.endpoint, self._events, self._selector)
+
+
+def _still_there(known: Iterable[Known], inputs: Sequence[InputConfig]) -> list[Known]:
+    """Return known places without those that nobody calls or listens for any more."""
+    calls = (Transport.TCP_CLIENT, Transport.SERIAL)
+    dialled = {f"{one.name} {one.endpoint}" for one in inputs if one.endpoint.transport in calls}
+    heard = tuple(f"{one.name} " for one in inputs if one.endpoint.transport not in calls)
+    return [one for one in known if one.host in dialled or one.host.startswith(heard)]
