@@ -359,8 +359,8 @@ class _Growth:
             found = settle(problem, found.values, replace(found.weights, is_trusting=False), most=5)
         at, solution = found.values, found.solution
         J, tags = len(at.anchors), 3 * len(at.tags)
-        own = solution.constants_cov[tags : tags + 3 * J, tags : tags + 3 * J]
-        of_anchors = own.reshape(J, 3, J, 3)[np.arange(J), :, np.arange(J)]
+        placed = solution.constants_cov[tags : tags + 3 * J, tags : tags + 3 * J]
+        of_anchors = placed.reshape(J, 3, J, 3)[np.arange(J), :, np.arange(J)]
         sigma = scale_sigma(at, solution.constants_cov) if J else np.nan
         state, reasons = _judged(stated, problem, found, ranges.names, sigma, of_anchors)
         return TagPath(
