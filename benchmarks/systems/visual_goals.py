@@ -142,6 +142,9 @@ RUNS: Final[Mapping[str, int]] = {
     "corridor-mono": 5,
     "corridor-small": 20,
     "room-long": 1,
+    "tags-loop-2d_s5": 1,
+    "tags-loop-3d_s5": 1,
+    "tags-loop-2d-fast_s1": 1,
 }
 """Runs of each case that the goals ask for; runs of one path follow each other."""
 
@@ -208,6 +211,12 @@ GOALS: Final[tuple[Goal, ...]] = (
     Goal(
         ("room-threads",), "tracking, 99th percentile, ms of wall, worst",
         worst("room-threads", "tracking_p99_s", factor=1e3), 33.0,
+    ),
+    *_accuracy("tags-loop-2d_s5", 0.10, 0.7, 0.5),
+    *_accuracy("tags-loop-3d_s5", 0.10, 0.7, 0.5),
+    Goal(
+        ("tags-loop-2d-fast_s1",), "called good with a scale more than 5 % off, runs",
+        good_and_far_off("tags-loop-2d-fast_s1", 0.05), 0.0,
     ),
     Goal(("room-long",), "memory at its highest, MiB", worst("room-long", "peak_mib"), 1024.0),
 )  # fmt: skip

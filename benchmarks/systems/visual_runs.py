@@ -23,7 +23,7 @@ from benchmarks.report import Option, Report, note, number_text, table
 from benchmarks.systems.visual_goals import GOALS, RUNS, goal_cells, good_rows
 from benchmarks.systems.visual_goals import HEADER as GOALS_HEADER
 from ssm_graph.study.ledger import ERROR, Key, Ledger, Row, run_trials
-from ssm_graph.systems.visual_ranges.study import CASES, FIRST_FRESH, RECORDED, case_of, trial
+from ssm_graph.systems.visual_ranges.study import CASES, FIRST_FRESH, RECORDED, TAGS, case_of, trial
 
 HEADER = (
     "case",
@@ -51,6 +51,8 @@ def about(case: str) -> str:
     """Return a case in words."""
     if case in RECORDED:
         return RECORDED[case].about
+    if case in TAGS:
+        return f"STAR-loc {TAGS[case]}, tags and ranges alone"
     return case_of(case).about + (", 320 x 240" if case.endswith("-small") else "")
 
 

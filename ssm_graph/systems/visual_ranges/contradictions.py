@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.systems.visual_ranges.range_fit import BIAS_M, Problem, Solution, polished
+from ssm_graph.systems.visual_ranges.ranges import Indices
 from ssm_graph.systems.visual_ranges.weights import robust_rms
 
 Mask = NDArray[np.bool_]
@@ -36,18 +37,11 @@ def contradictions(
     rms_sigmas : up to which residuals may be wider than stated.
     marked_share : of an anchor's ranges that may be too long.
     """
-    at, told = problem.places, []
-    for j, name in enumerate(names):
-        own = at.anchor == j
-        stated, seen = float(np.median(stated_m[own])), robust_rms(best.error[own])
-        if seen > rms_sigmas * stated:
-            told.append(f"residuals of anchor {name} are {seen:.2f} m, {stated:.2f} m were stated")
-        bias = float(best.biases[j])
-        if abs(bias) > 3.0 * BIAS_M:
-            told.append(f"the bias of anchor {name} would be {bias:.2f} m")
-        marked = float(np.mean(best.error[own] < -4.0 * at.sigma_m[own]))
-        if marked > marked_share:
-            told.append(f"{100.0 * marked:.0f} % of the ranges to anchor {name} are too long")
+    at = problem.places
+    told = misfits(
+        names, at.anchor, best.error, at.sigma_m, best.biases,
+        stated_m=stated_m, rms_sigmas=rms_sigmas, marked_share=marked_share,
+    )  # fmt: skip
     first = at.time_s < np.median(at.time_s)
     halves = [polished(_part(problem, half), best) for half in (first, ~first)]
     apart = np.log(halves[0].scale / halves[1].scale)
@@ -65,6 +59,39 @@ def contradictions(
                 f"anchor {name} moves by {np.linalg.norm(way):.2f} m between the first and the "
                 "second half: did it move, or is the antenna not calibrated?"
             )
+    return told
+
+
+def misfits(
+    names: tuple[str, ...],
+    anchor: Indices,
+    error: Array,
+    sigma_m: Array,
+    biases: Array,
+    *,
+    stated_m: Array,
+    rms_sigmas: float,
+    marked_share: float,
+) -> list[str]:
+    """Return which anchors' ranges are wider, longer or more biased than may be, a sentence each.
+
+    Parameters
+    ----------
+    anchor, error, sigma_m : (M,) of the ranges; errors are predicted minus measured, m.
+    biases : (J,) m
+    stated_m, rms_sigmas, marked_share : as in :func:`contradictions`.
+    """
+    told = []
+    for j, name in enumerate(names):
+        own = anchor == j
+        stated, seen = float(np.median(stated_m[own])), robust_rms(error[own])
+        if seen > rms_sigmas * stated:
+            told.append(f"residuals of anchor {name} are {seen:.2f} m, {stated:.2f} m were stated")
+        if abs(biases[j]) > 3.0 * BIAS_M:
+            told.append(f"the bias of anchor {name} would be {biases[j]:.2f} m")
+        marked = float(np.mean(error[own] < -4.0 * sigma_m[own]))
+        if marked > marked_share:
+            told.append(f"{100.0 * marked:.0f} % of the ranges to anchor {name} are too long")
     return told
 
 

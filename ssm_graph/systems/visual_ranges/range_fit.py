@@ -19,7 +19,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from ssm_graph.base.frozen import Array, ReadOnlyArrays
-from ssm_graph.systems.visual_ranges.range_terms import CLOSEST_M, RangeTerms
+from ssm_graph.systems.visual_ranges.range_terms import CLOSEST_M, Places
 from ssm_graph.systems.visual_ranges.ranges import Indices
 from ssm_graph.systems.visual_ranges.weights import POLISH, RangeKernel
 
@@ -43,58 +43,6 @@ STEP_DEVIANCE: Final = 0.5
 """By which a reweighting may raise the deviance, which is not quite what it lowers."""
 SPACING_M: Final = 0.02
 """Standard deviation of the distance between two anchors whose places are known."""
-
-
-class Places(NamedTuple):
-    """Where the antenna was at each range, as vision has it, in map axes."""
-
-    camera: Array
-    """(M, 3) map units"""
-    velocity: Array
-    """(M, 3) map units/s"""
-    lever: Array
-    """(M, 3) m"""
-    lever_rate: Array
-    """(M, 3) m/s"""
-    anchor: Indices
-    """(M,)"""
-    range_m: Array
-    """(M,)"""
-    sigma_m: Array
-    """(M,)"""
-    time_s: Array
-    """(M,)"""
-    arm: Array | None = None
-    """(M, 3, 3) m for each coefficient of the lever arm's error; None where it is exact"""
-
-    def rows(self, kept: Indices) -> Places:
-        """Return some of them."""
-        return Places._make(None if column is None else column[kept] for column in self)
-
-
-def places_of(
-    terms: RangeTerms, R_cw: Array, t_cw: Array, time_s: Array, lever_sigma_m: float = 0.0
-) -> Places:
-    """Return the places of ranges that hang on key frames; ``time_s`` (all ranges,) their times.
-
-    ``lever_sigma_m``: standard deviation of each of the lever arm's three numbers.
-    """
-    R_wc = np.swapaxes(R_cw[terms.key_frame], 1, 2)
-
-    def turned(vector: Array) -> Array:
-        return np.asarray(np.einsum("mij,mj->mi", R_wc, vector))
-
-    return Places(
-        turned(terms.motion - t_cw[terms.key_frame]),
-        turned(terms.velocity),
-        turned(terms.lever),
-        turned(terms.lever_rate),
-        terms.anchor,
-        terms.range_m,
-        terms.sigma_m,
-        time_s[terms.row],
-        lever_sigma_m * R_wc @ terms.axes if lever_sigma_m and terms.axes is not None else None,
-    )
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

@@ -3,15 +3,27 @@
 from __future__ import annotations
 
 import itertools
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.systems.visual_ranges.range_fit import Places, Solution, problem_of
+from ssm_graph.systems.visual_ranges.range_fit import (
+    Problem,
+    Solution,
+    problem_of,
+    search,
+    solution,
+    unknowns_of,
+)
+from ssm_graph.systems.visual_ranges.range_terms import Places
 from ssm_graph.systems.visual_ranges.ranges import Indices
 from ssm_graph.systems.visual_ranges.start import StartRules, later_anchor
 from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, POLISH, robust_rms
+
+SAME_PLACE_M: Final = 0.2
+"""Nearer than this two places of an anchor are one."""
 
 
 def plain_errors(at: Places, found: Solution) -> tuple[Array, Array]:
@@ -52,6 +64,37 @@ def placed_later(
     if robust_rms(error) > rules.rms_sigmas * float(np.median(own.sigma_m)):
         return None
     return place, float(where[3]), covariance
+
+
+def against_rivals(
+    problem: Problem,
+    found: Solution,
+    i: int,
+    others: tuple[tuple[Array, float], ...],
+    gap: float,
+) -> tuple[Solution, tuple[tuple[Array, float], ...]]:
+    """Return the best solution with anchor ``i`` elsewhere, and its places that are as good.
+
+    ``others`` are places (3,) and biases to be tried, ``gap`` the deviance from which one is worse.
+    """
+    starts = [found.unknowns]
+    for place, bias in others:
+        anchors, biases = found.anchors.copy(), found.biases.copy()
+        anchors[i], biases[i] = place, bias
+        starts.append(unknowns_of(problem, found.scale, anchors, biases, found.clock_s))
+    fit = search(problem, np.array(starts))
+    best = int(np.argmin(fit.cost))
+    if best and fit.cost[best] < fit.cost[0] - gap:
+        found = solution(problem, fit.unknowns[best], is_near=True)
+    kept: list[tuple[Array, float]] = []
+    for unknowns, cost in zip(fit.unknowns, fit.cost, strict=True):
+        one = unknowns[2 + 4 * i : 6 + 4 * i]
+        place = one[:3] + np.exp(unknowns[0]) * problem.middle
+        taken = np.array([found.anchors[i], *(other for other, _ in kept)])
+        is_new = float(np.linalg.norm(taken - place, axis=1).min()) > SAME_PLACE_M
+        if is_new and cost < float(fit.cost.min()) + gap:
+            kept.append((place, float(one[3])))
+    return found, (*kept,)
 
 
 def is_sharp(found: Solution, rules: StartRules, at: Places, i: int) -> bool:

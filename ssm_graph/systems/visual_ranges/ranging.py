@@ -14,10 +14,8 @@ import numpy as np
 from ssm_graph.base.frozen import Array
 from ssm_graph.systems.visual_ranges.bundle_ranges import BundleRanges
 from ssm_graph.systems.visual_ranges.range_fit import (
-    Places,
     Problem,
     Solution,
-    places_of,
     polished,
     problem_of,
     search,
@@ -25,6 +23,7 @@ from ssm_graph.systems.visual_ranges.range_fit import (
     unknowns_of,
 )
 from ssm_graph.systems.visual_ranges.range_rows import (
+    against_rivals,
     is_sharp,
     known_spacing,
     largest_turn,
@@ -33,7 +32,13 @@ from ssm_graph.systems.visual_ranges.range_rows import (
     placed_later,
     plain_errors,
 )
-from ssm_graph.systems.visual_ranges.range_terms import FramePoses, RangeTerms, hang
+from ssm_graph.systems.visual_ranges.range_terms import (
+    FramePoses,
+    Places,
+    RangeTerms,
+    hang,
+    places_of,
+)
 from ssm_graph.systems.visual_ranges.ranges import Indices, Ranges
 from ssm_graph.systems.visual_ranges.ranging_result import Anchor, AnchorState, RangingResult
 from ssm_graph.systems.visual_ranges.start import (
@@ -55,7 +60,6 @@ RECENT_S: Final = 5.0
 CHECK_AGAIN: Final = 1.5
 """And all is searched again when so many times the ranges are there."""
 LEAST_RECENT: Final = 20
-SAME_PLACE_M: Final = 0.2
 DOUBTFUL_SHARE: Final = 0.6
 """Of the last 5 s of an anchor's ranges, with next to no weight."""
 
@@ -355,10 +359,13 @@ class Ranging:
         return told
 
     def _rivals(self, problem: Problem) -> None:
-        """Try the other places of anchors that have some."""
+        """Try the other places of anchors that have some; keep what is best, and as good."""
+        assert self.found is not None
         for i, j in enumerate(self.used):
-            if self.anchors[j].alternatives:
-                self._against_rivals(problem, i)
+            known = self.anchors[j].alternatives
+            if known:
+                self.found, kept = against_rivals(problem, self.found, i, known, self.rules.gap)
+                self._set(j, alternatives=kept)
 
     def _sharpened(self, at: Places, weight: Array, now: float) -> list[str]:
         """Judge the anchors anew: sharpness, and whether the last ranges fit."""
@@ -378,30 +385,6 @@ class Ranging:
                 told.append(f"anchor {own.name}: {state.value}")
             self._set(j, state=state, lost_s=lost_s)
         return told
-
-    def _against_rivals(self, problem: Problem, i: int) -> None:
-        """Try an anchor's other places, take the best, and keep those that are as good."""
-        assert self.found is not None
-        found, own = self.found, self.anchors[self.used[i]]
-        starts = [found.unknowns]
-        for place, bias in own.alternatives:
-            anchors, biases = found.anchors.copy(), found.biases.copy()
-            anchors[i], biases[i] = place, bias
-            starts.append(unknowns_of(problem, found.scale, anchors, biases, found.clock_s))
-        fit = search(problem, np.array(starts))
-        best = int(np.argmin(fit.cost))
-        if best and fit.cost[best] < fit.cost[0] - self.rules.gap:
-            self.found = found = solution(problem, fit.unknowns[best], is_near=True)
-        least = float(fit.cost.min())
-        kept: list[tuple[Array, float]] = []
-        for unknowns, cost in zip(fit.unknowns, fit.cost, strict=True):
-            one = unknowns[2 + 4 * i : 6 + 4 * i]
-            place = one[:3] + np.exp(unknowns[0]) * problem.middle
-            taken = np.array([found.anchors[i], *(other for other, _ in kept)])
-            is_new = float(np.linalg.norm(taken - place, axis=1).min()) > SAME_PLACE_M
-            if is_new and cost < least + self.rules.gap:
-                kept.append((place, float(one[3])))
-        self._set(self.used[i], alternatives=(*kept,))
 
     def _later(self, places: Places) -> list[str]:
         """Place anchors that have ranges enough by now, and anew those that seem to have moved."""

@@ -20,7 +20,6 @@ from ssm_graph.systems.visual_ranges.observability import Motion, Shape, advice,
 from ssm_graph.systems.visual_ranges.range_fit import (
     BIAS_WALK_M,
     DRIFT,
-    Places,
     Problem,
     Solution,
     polished,
@@ -28,6 +27,7 @@ from ssm_graph.systems.visual_ranges.range_fit import (
     search,
     solution,
 )
+from ssm_graph.systems.visual_ranges.range_terms import Places
 from ssm_graph.systems.visual_ranges.ranges import Indices
 from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, RangeKernel
 from ssm_graph.systems.visual_ranges.widening import widened

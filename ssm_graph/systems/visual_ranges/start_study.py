@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 from factors.so3 import exp
 from ssm_graph.base.frozen import Array
 from ssm_graph.study.ledger import Key
-from ssm_graph.systems.visual_ranges.range_fit import Places, places_of
-from ssm_graph.systems.visual_ranges.range_terms import FramePoses, hang
+from ssm_graph.systems.visual_ranges.range_terms import FramePoses, Places, hang, places_of
 from ssm_graph.systems.visual_ranges.readers.starloc import StarLocRun
 from ssm_graph.systems.visual_ranges.simulate import (
     Run,

@@ -22,9 +22,11 @@ from ssm_graph.systems.visual_ranges.accuracy import accuracy, true_places
 from ssm_graph.systems.visual_ranges.loop_settings import LoopSettings
 from ssm_graph.systems.visual_ranges.ranges import screened_ranges
 from ssm_graph.systems.visual_ranges.readers.source import read_sequence
+from ssm_graph.systems.visual_ranges.readers.starloc import read_starloc
 from ssm_graph.systems.visual_ranges.result import FrameState, VisualResult
 from ssm_graph.systems.visual_ranges.sequence import ImageOf, Sequence
 from ssm_graph.systems.visual_ranges.settings import VisualSettings
+from ssm_graph.systems.visual_ranges.similarity3 import umeyama
 from ssm_graph.systems.visual_ranges.simulate import (
     SMALL_CAMERA,
     ImageFaults,
@@ -35,6 +37,7 @@ from ssm_graph.systems.visual_ranges.simulate import (
 )
 from ssm_graph.systems.visual_ranges.simulated_ranges import RangeFaults, with_simulated_ranges
 from ssm_graph.systems.visual_ranges.system import run
+from ssm_graph.systems.visual_ranges.tag_start import tag_path
 from ssm_graph.systems.visual_ranges.verdict import judged
 
 FIRST_FRESH: Final = 1000
@@ -110,6 +113,10 @@ RECORDED: Final[Mapping[str, Recorded]] = {
 }
 """By name; with ``-arm`` what the truth is a path of, from which ranges are simulated, is not taken
 for the camera: it may be elsewhere on the car, or on the sensor in the hand."""
+TAGS: Final[Mapping[str, str]] = {
+    f"tags-{name}": name for name in ("loop-2d_s5", "loop-3d_s5", "loop-2d-fast_s1")
+}
+"""Runs of STAR-loc, by tags and ranges alone; the radios of the last are not calibrated."""
 CASES: Final[Mapping[str, Case]] = {
     "room": Case("room, one anchor", Run("room")),
     "room-mono": Case("room, no ranges", Run("room"), has_ranges=False),
@@ -176,6 +183,8 @@ def case_of(name: str) -> Case:
 def trial(key: Key) -> Row:
     """Do one run; the key is the name of a case, a seed, and how long, s (0: as the case says)."""
     name, seed, duration_s = str(key[0]), int(key[1]), float(key[2])
+    if name in TAGS:
+        return tag_trial(name)
     simulated = None
     if name in RECORDED:
         case = Case("", Run())
@@ -208,6 +217,42 @@ def trial(key: Key) -> Row:
         **_loops(sequence, result),
     }
     return row if simulated is None else row | _weights(simulated, result)
+
+
+def tag_trial(name: str) -> Row:
+    """Return the errors of a run of STAR-loc from the centres of tags and ranges alone.
+
+    Seconds and images are those in which a tag is seen; no seed plays a part.
+    """
+    recorded_run = read_starloc(data_folder() / "starloc" / TAGS[name])
+    begin, wall = time.process_time(), time.perf_counter()
+    found = tag_path(recorded_run.sightings, recorded_run.ranges, recorded_run.lever_arm_m)
+    spent = {"cpu_s": time.process_time() - begin, "wall_s": time.perf_counter() - wall}
+    image_s = np.unique(recorded_run.sightings.time_s)
+    true = true_places(recorded_run.truth, image_s)
+    kept = np.isfinite(true).all(axis=1)
+    place = found.place[np.searchsorted(found.time_s, image_s[kept])]
+    metric = umeyama(place, true[kept], with_scale=False)
+    similar = umeyama(place, true[kept], with_scale=True)
+    anchor_m = np.nan
+    if len(found.anchors):
+        away = metric.apply(found.anchors) - recorded_run.anchor_truth_m
+        anchor_m = float(np.nanmax(np.linalg.norm(away, axis=1)))
+    return {
+        "verdict": found.state.name, "tracked": 1.0, "tracked_last": 1.0,
+        "n_key_frames": len(found.time_s), "n_images": len(image_s),
+        "metric_m": root_mean_square(metric.apply(place) - true[kept]),
+        "similar_m": root_mean_square(similar.apply(place) - true[kept]),
+        "scale": 1.0 / similar.scale - 1.0, "scale_sigma": found.sigma_log_scale,
+        "anchor_m": anchor_m, "started_s": np.nan, "clock_s": found.clock_s,
+        "rate_hz": len(image_s) / spent["wall_s"], "peak_mib": _peak_mib(), **spent,
+        **dict.fromkeys(("taken_true", "taken_false", "refused_true", "refused_false"), 0),
+    }  # fmt: skip
+
+
+def root_mean_square(error: NDArray[np.float64]) -> float:
+    """Return the rms length of errors (N, 3)."""
+    return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
 
 
 def _rendered_before(asked: Run, sequence: Sequence) -> ImageOf:

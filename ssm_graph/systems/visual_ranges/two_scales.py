@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from ssm_graph.systems.visual_ranges.range_fit import Places
+from ssm_graph.systems.visual_ranges.range_terms import Places
 from ssm_graph.systems.visual_ranges.start import Start, StartRules, find_start
 
 SIGMAS: Final = 3.0

@@ -323,7 +323,7 @@ def test_real_starloc() -> None:
     at = np.column_stack([np.interp(run.ranges.time_s, run.truth.time_s, x) for x in antenna.T])
     line = np.linalg.norm(at - run.anchor_truth_m[run.ranges.anchor], axis=1)
     assert np.median(run.ranges.range_m - line) == pytest.approx(-0.097, abs=0.01)
-    row = np.abs(run.truth.time_s[None] - run.tag_time_s[:, None]).argmin(axis=1)
-    places = np.array([run.tag_truth_m[int(tag)] for tag in run.tag])
+    row = np.abs(run.truth.time_s[None] - run.sightings.time_s[:, None]).argmin(axis=1)
+    places = np.array([run.tag_truth_m[int(tag)] for tag in run.sightings.tag])
     seen = run.camera.project(turn[row].inv().apply(places - run.truth.position_m[row]))
-    assert np.nanmedian(np.linalg.norm(seen - run.tag_pixel, axis=1)) < 15.0
+    assert np.nanmedian(np.linalg.norm(seen - run.sightings.left, axis=1)) < 15.0

@@ -15,15 +15,9 @@ from ssm_graph.base.frozen import Array
 from ssm_graph.systems.visual_ranges.bundle_ranges import BundleRanges
 from ssm_graph.systems.visual_ranges.geometry import Pose
 from ssm_graph.systems.visual_ranges.loops import judge_of
-from ssm_graph.systems.visual_ranges.range_fit import (
-    Places,
-    problem_of,
-    residuals,
-    solution,
-    unknowns_of,
-)
+from ssm_graph.systems.visual_ranges.range_fit import problem_of, residuals, solution, unknowns_of
 from ssm_graph.systems.visual_ranges.range_rows import known_spacing
-from ssm_graph.systems.visual_ranges.range_terms import FramePoses, RangeTerms, hang
+from ssm_graph.systems.visual_ranges.range_terms import FramePoses, Places, RangeTerms, hang
 from ssm_graph.systems.visual_ranges.ranges import Ranges, screened_ranges
 from ssm_graph.systems.visual_ranges.ranging import Ranging
 from ssm_graph.systems.visual_ranges.ranging_result import AnchorState

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ssm_graph.base.errors import DataError
@@ -24,6 +23,7 @@ from ssm_graph.systems.visual_ranges.camera import Camera
 from ssm_graph.systems.visual_ranges.ranges import Ranges, screened_ranges
 from ssm_graph.systems.visual_ranges.readers.calibration import make_camera
 from ssm_graph.systems.visual_ranges.sequence import PathTruth
+from ssm_graph.systems.visual_ranges.tag_rows import TagSightings
 
 SIZE: Final = (1920, 1080)
 """Of the rectified images, pixels."""
@@ -47,12 +47,8 @@ class StarLocRun(ShortRepr):
     """(J, 3) m, world"""
     error_m: Array
     """(M,) range less the true one, m"""
-    tag_time_s: Array
-    """(n,)"""
-    tag: NDArray[np.int64]
-    """(n,) number of each April tag seen"""
-    tag_pixel: Array
-    """(n, 2) of its centre in the left image"""
+    sightings: TagSightings
+    """Of the centres of April tags, in both images"""
     tag_truth_m: dict[int, Array]
     """(3,) by tag number, m, world"""
 
@@ -69,9 +65,10 @@ def read_starloc(folder: Path, antenna: int | None = None) -> StarLocRun:
     uwb, tags = _table(folder / "uwb.csv"), _table(folder / "apriltag.csv")
     calibration = _json(folder / "calib.json")
     try:
-        k = [float(calibration[name]) for name in ("fu", "fv", "cu", "cv")]
+        *k, baseline_m = [float(calibration[name]) for name in ("fu", "fv", "cu", "cv", "b")]
     except (KeyError, TypeError) as error:
-        raise DataError(f"{folder / 'calib.json'}: expected fu, fv, cu, cv") from error
+        raise DataError(f"{folder / 'calib.json'}: expected fu, fv, cu, cv, b") from error
+    camera = make_camera(str(folder / "calib.json"), SIZE, k)
     R_cr, t_cr = _camera_on_rig(folder)
     radios = uwb["from_id"].astype(int)
     if antenna is None:
@@ -95,15 +92,20 @@ def read_starloc(folder: Path, antenna: int | None = None) -> StarLocRun:
         wrong[kept] = (rows["range"] - rows["gt_range"])[mine][at]
     return StarLocRun(
         folder.name,
-        make_camera(str(folder / "calib.json"), SIZE, k),
+        camera,
         ranges,
         lever,
         _path(uwb, R_cr, t_cr),
         np.array([places.get(name, np.full(3, np.nan)) for name in ranges.names]),
         wrong,
-        tags["time_s"],
-        tags["apriltag_id"].astype(np.int64),
-        np.column_stack([tags["left_u"], tags["left_v"]]),
+        TagSightings(
+            camera,
+            tags["time_s"],
+            tags["apriltag_id"].astype(np.intp),
+            np.column_stack([tags["left_u"], tags["left_v"]]),
+            np.column_stack([tags["right_u"], tags["right_v"]]),
+            baseline_m,
+        ),
         _tags(folder),
     )
 
