@@ -13,7 +13,10 @@ import numpy as np
 from benchmarks.report import ROOT, Option, Report, mean_text, note, ratio_text, table
 from ssm_graph.base.frozen import Array
 from ssm_graph.systems.landmark_slam.association import Association
+from ssm_graph.systems.landmark_slam.filtered import filtered
 from ssm_graph.systems.landmark_slam.methods import INCREMENTAL
+from ssm_graph.systems.landmark_slam.problem import SlamNoise, SlamProblem
+from ssm_graph.systems.landmark_slam.smoother import Values, smooth_landmarks
 from ssm_graph.systems.landmark_slam.solve import Asked, Solved, solve_input
 from ssm_graph.systems.landmark_slam.study import Scores, run_batch
 
@@ -29,6 +32,8 @@ WAYS = {
     "literal noise-adaptive filter": Asked("naukf"),
     "smoother, landmarks without names": Asked(association=Association.JOINT),
 }
+NEWEST = 10
+"""Times, evenly spread, at which the newest pose is looked at: each is a solution of its own."""
 DATA = Path(os.environ.get("SSM_GRAPH_DATA", ROOT.parent / "shared" / "data")) / "systems"
 
 
@@ -90,6 +95,50 @@ def real(folder: Path, robots: Sequence[int]) -> Iterator[str]:
     yield from table((*header, "association wrong, left out", "CPU s"), rows)
 
 
+def newest(folder: Path, robots: Sequence[int]) -> Iterator[str]:
+    """Yield the table of what the newest pose is worth, whoever finds it."""
+    rows = []
+    for robot in robots:
+        note(f"robot {robot}, newest pose")
+        whole = solve_input(folder, Asked(robot=robot))
+        problem, noise = whole.problem, whole.answer.noise
+        at = np.linspace(0, len(problem.time_s) - 1, NEWEST + 1).astype(int)[1:]
+        at = at[np.isfinite(whole.truth[at, 0])]
+        begin = Values(whole.answer.pose, whole.answer.landmarks, whole.answer.drift)
+        until = [_until(problem, noise, begin, int(k)) for k in at]
+        learnt = filtered(problem, noise, "ekf-weighted").pose[at]
+        guessed = solve_input(folder, Asked("ekf-weighted", robot=robot)).answer.pose[at]
+        errors = [
+            float(np.sqrt(np.mean(np.sum((pose - whole.truth[at])[:, :2] ** 2, axis=1))))
+            for pose in (whole.answer.pose[at], np.array(until), learnt, guessed)
+        ]
+        rows.append((str(robot), str(len(at)), *(f"{error:.3f}" for error in errors)))
+    yield ""
+    yield f"{folder.name}, the newest pose at {NEWEST} times: rms in the frame of the start, m. The"
+    yield "batch has all that was seen until then, and the noise that the whole log tells."
+    yield ""
+    header = ("robot", "times", "smoother of the whole log", "batch until then")
+    yield from table((*header, "filter, the same noise", "filter, noise guessed"), rows)
+
+
+def _until(problem: SlamProblem, noise: SlamNoise, begin: Values, k: int) -> Array:
+    """Return pose k (3,) by all that was seen until then."""
+    seen = int(np.searchsorted(problem.keyframe, k, side="right"))
+    names, landmark = np.unique(problem.landmark[:seen], return_inverse=True)
+    cut = replace(
+        problem,
+        time_s=problem.time_s[: k + 1],
+        control=problem.control[:k],
+        keyframe=problem.keyframe[:seen],
+        landmark=landmark,
+        measured=problem.measured[:seen],
+        names=tuple(problem.names[i] for i in names),
+        observation_scale=problem.scales[:seen],
+    )
+    first = Values(begin.pose[: k + 1], begin.landmarks[names], begin.drift)
+    return np.asarray(smooth_landmarks(cut, noise, first).pose[-1])
+
+
 def _told(robot: str, name: str, solved: Solved, began: float) -> tuple[str, ...]:
     score, errors = solved.score, solved.errors
     assert score is not None
@@ -141,12 +190,16 @@ def main() -> None:
         Option("--steps", 2000, "of each run"),
         Option("--first-seed", 2000, "of the simulated runs"),
         Option("--robots", [1, 2, 3, 4, 5], "of MRCLAM 6; without data none"),
+        Option("--robots-of-7", [4, 5], "of MRCLAM 7"),
     )
     arguments = report.args
     lines = [*simulated(arguments.runs, arguments.steps, arguments.first_seed)]
-    folder = DATA / "mrclam" / "MRCLAM_Dataset6"
-    if folder.is_dir() and arguments.robots:
-        lines += real(folder, arguments.robots)
+    for number, robots in ((6, arguments.robots), (7, arguments.robots_of_7)):
+        folder = DATA / "mrclam" / f"MRCLAM_Dataset{number}"
+        if folder.is_dir() and robots:
+            lines += real(folder, robots)
+            lines += newest(folder, robots)
+    if (DATA / "victoria_park").is_dir() and arguments.robots:
         lines += victoria(DATA / "victoria_park")
     report.write(lines)
 
