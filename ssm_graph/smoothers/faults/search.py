@@ -312,6 +312,8 @@ def chosen_of(ranked: Sequence[Candidate]) -> Candidate | None:
     if not significant:
         return None
     best = significant[0]
+    if best.hypothesis.channel != IMU:
+        return best
     others = (
         one
         for one in significant
