@@ -137,7 +137,7 @@ class Look:
     def _possible_in(self, left: Judged) -> list[Fault]:
         """Return the likeliest jump of one gyro that goes on to the end of the mission."""
         edges, found = left.grid.edges, []
-        if edges[-1] < len(self._keyframe_s):
+        if left.grid.n_blocks < 2 or edges[-1] < len(self._keyframe_s):
             return []
         for one in self.hypotheses:
             if one.channel == IMU and len(one.sigma) == 1:
