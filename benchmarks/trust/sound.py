@@ -49,8 +49,10 @@ class Sound(NamedTuple):
     """Horizontal rms of least squares without a search: the best where noise is as stated"""
     sigma_ratio: float = np.nan
     """Horizontal sigma by that of least squares, roots of the mean squares"""
-    apart: tuple[float, float] = (np.nan, np.nan)
-    """Mean square distance from least squares, by its variance: horizontal and up"""
+    apart: float = np.nan
+    """Mean square distance from least squares, by its variance: horizontally, and"""
+    apart_up: float = np.nan
+    """upwards"""
 
 
 def run(key: Key) -> Row:
@@ -76,8 +78,8 @@ def run(key: Key) -> Row:
         least = smooth(sim.mission, SmootherConfig(kernel=GaussianKernel()))
         best = errors_of(sim, least)
         ratio = found.sigma_m / best.sigma_m
-        apart = _apart(sim, estimate, least)
-        made = made._replace(least_m=best.rms_m[0], sigma_ratio=ratio, apart=apart)
+        level, up = _apart(sim, estimate, least)
+        made = made._replace(least_m=best.rms_m[0], sigma_ratio=ratio, apart=level, apart_up=up)
     return made._asdict()
 
 
@@ -143,7 +145,9 @@ def price_line(grade: str, runs: Sequence[Sound]) -> list[str]:
     n = len(runs)
     error = np.sqrt((n - 1) / n * np.sum((np.array(left_out) - np.mean(left_out)) ** 2))
     sigma = np.sqrt(np.mean([one.sigma_ratio**2 for one in runs]))
-    prices = (_mean(50.0 * of, digits=2) for of in np.array([one.apart for one in runs]).T)
+    prices = (
+        _mean(50.0 * of, digits=2) for of in np.array([(one.apart, one.apart_up) for one in runs]).T
+    )
     return [grade, str(n), f"{ratio:.4f} ± {error:.4f}", f"{sigma:.4f}", *prices]
 
 
