@@ -137,7 +137,7 @@ class Look:
     def _possible_in(self, left: Judged) -> list[Fault]:
         """Return the likeliest jump of one gyro that goes on to the end of the mission."""
         edges, found = left.grid.edges, []
-        if edges[-1] < len(self._keyframe_s):
+        if edges[-1] < len(self._keyframe_s) or left.grid.n_blocks == 1:
             return []
         for one in self.hypotheses:
             if one.channel == IMU and len(one.sigma) == 1:
@@ -312,6 +312,8 @@ def chosen_of(ranked: Sequence[Candidate]) -> Candidate | None:
     if not significant:
         return None
     best = significant[0]
+    if best.hypothesis.channel != IMU:
+        return best
     others = (
         one
         for one in significant
