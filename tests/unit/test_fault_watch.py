@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 
-from ssm_graph.base.stepwise import finished
+from ssm_graph.base.stepwise import Steps, finished
 from ssm_graph.engine.error_state import ACCEL_BIAS, GYRO_BIAS
 from ssm_graph.engine.states import States
 from ssm_graph.graph.linearize import GraphLinearizer
@@ -48,7 +46,7 @@ class Scripted:
         monkeypatch.setattr(PieceSearch, "find_steps", self._find_steps)
         monkeypatch.setattr(PieceSearch, "beside", self._beside)
 
-    def _find_steps(self, *_: object) -> Iterator[float]:
+    def _find_steps(self, *_: object) -> Steps[list[Fault]]:
         self.found_at.append("search")
         yield 0.0
         return []
