@@ -233,7 +233,7 @@ class SsmSmoother:
         says, noisy = informative(
             DVL, t, weights, beams_s, used.of_beams.kernel, freed=linearizer.has_freed_beam
         )
-        found = [noisy and noisy_or_compared(noisy, problem.beams)]
+        found = [noisy and noisy_or_compared(noisy, problem.beams, beams_s)]
         beams = says / faults.inflation_of(DVL)
         for aid, kernel in zip(aids.all, used.of_aids.kernels, strict=True):
             own = aids.of(aid, last.aid_lengths.square), aids.of(aid, last.aid_weights)

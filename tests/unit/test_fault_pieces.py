@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,8 @@ import pytest
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.mission.fault import DetectedFault
 from ssm_graph.mission.problem import build_problem
-from ssm_graph.simulation import DvlSettings, Fault, Grade
+from ssm_graph.simulation import DvlSettings, Fault, Grade, with_faults
+from ssm_graph.simulation.faults import Sensor
 from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
 from ssm_graph.smoothers.faults.hypotheses import Course, Hypothesis
 from ssm_graph.smoothers.faults.judged import Fault as Found
@@ -34,6 +36,25 @@ def found_in(*faults: Fault) -> tuple[DetectedFault, ...]:
     )
     config = SmootherConfig(fault_search=FaultSearch(piece_s=PIECE_S))
     return SsmSmoother(config).solve(build_problem(sim.mission)).faults
+
+
+@pytest.mark.parametrize(("jump", "seed"), [(0.1, 3), pytest.param(0.2, 5, marks=pytest.mark.slow)])
+def test_a_gyro_that_jumped_in_one_piece_counts_to_the_end(jump: float, seed: int) -> None:
+    """One that may be chance, and one that is freed: by deg/s, at a quiet speed; sigmas hold."""
+    fault = Fault(sensor=Sensor.GYROS, start_s=60.4, size=math.radians(jump), axes=(2,))
+    sim = simulated(duration_s=200.0, grade=Grade.TACTICAL, dvl=DvlSettings(noise=0.005), seed=seed)
+    broken = with_faults(sim.mission, (fault,), truth=sim.truth_at)
+    config = SmootherConfig(fault_search=FaultSearch(piece_s=PIECE_S))
+    estimate = SsmSmoother(config).solve(build_problem(broken.mission))
+    found = next(one for one in estimate.faults if one.sensor == "gyros")
+    assert abs(found.begin_s - fault.start_s) < 12.0
+    assert found.end_s == estimate.trajectory.time_s[-1]
+    frame, track = sim.mission.frame, estimate.trajectory
+    truth = sim.truth_at(track.time_s)
+    off = frame.p_n_from_geodetic(track.lat, track.lon, track.height)
+    off -= frame.p_n_from_geodetic(truth.lat, truth.lon, truth.height)
+    sigma = np.sqrt(np.diagonal(track.position_cov_enu, axis1=1, axis2=2))
+    assert np.max(np.abs(off) / sigma) < 4.0
 
 
 @pytest.mark.parametrize(

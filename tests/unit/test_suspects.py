@@ -135,6 +135,18 @@ def test_outliers_accuse_no_clock(seed: int) -> None:
     assert not find_suspects(mission)
 
 
+def test_a_gap_of_the_inertial_data_accuses_nobody() -> None:
+    """Turns that nobody saw are no clock's fault; what is wrong beside the gap is still told."""
+    fixes = GnssSettings(windows=((0.0, 120.0),))
+    mission = simulated(duration_s=120.0, seed=4, gnss=fixes).mission
+    imu = mission.imu
+    kept = (imu.time_s < 12.0) | (imu.time_s > 20.0)
+    rows = {name: getattr(imu, name)[kept] for name in ("time_s", "gyro_b", "accel_b")}
+    assert not find_suspects(with_imu(mission, **rows))
+    rows["gyro_b"] = 0.6 * rows["gyro_b"]
+    assert {found.sensor for found in find_suspects(with_imu(mission, **rows))} == {"gyros"}
+
+
 @pytest.mark.slow
 def test_other_lies_accuse_no_clock() -> None:
     """A position that jumps, a bottom that moves: no clock, no unit explains them."""

@@ -99,10 +99,13 @@ def test_beams_that_agree_are_not_called_noisy(noise: float, sensor: str) -> Non
     beams = dataclasses.replace(beams, speed=speed)
     assert np.std(parity_of(beams)) == pytest.approx(noise, rel=0.2)
     said = DetectedFault("DVL", "errs", 0.0, 200.0, 1e4, 800, Treatment.WIDENED)
-    found = noisy_or_compared(said, beams)
-    assert found.sensor == sensor
-    of_three = beams.take(beams.beam < 3)
-    assert noisy_or_compared(said, of_three).sensor == "DVL"
+    time_s = problem.keyframe_s[beams.keyframe]
+    assert noisy_or_compared(said, beams, time_s).sensor == sensor
+    early, late = time_s < 140.0, dataclasses.replace(said, begin_s=140.0)
+    quiet = dataclasses.replace(beams, speed=np.where(early, speed - own * (1 - 1 / noise), speed))
+    assert noisy_or_compared(late, quiet, time_s).sensor == sensor
+    of_three = beams.beam < 3
+    assert noisy_or_compared(said, beams.take(of_three), time_s[of_three]).sensor == "DVL"
 
 
 @pytest.mark.parametrize("n", [30, 60, 150])

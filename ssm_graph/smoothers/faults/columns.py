@@ -243,6 +243,17 @@ def _beam_weights(problem: Problem, beams: BeamRows) -> Array:
     return weights
 
 
+def columns_of_biases(rows: Array, n: int) -> Array:
+    """Return what a unit of each bias does to the whitened inertial rows (K - 1, 15, 6).
+
+    ``rows`` (K - 1, r, 2 n or more) are those of two successive states of ``n`` numbers each.
+    """
+    # A bias at the begin acts on the motion and on the bias at the end, that at the end on the
+    # latter alone, the other way round.
+    begin, end = slice(ACCEL_BIAS.start, STATE_DIM), slice(n + ACCEL_BIAS.start, n + STATE_DIM)
+    return np.asarray(rows[:, :STATE_DIM, begin] + rows[:, :STATE_DIM, end])
+
+
 class Channels:
     """All channels of a linearised mission, and their columns."""
 
@@ -319,12 +330,9 @@ class Channels:
         return made
 
     def _between(self) -> Array:
-        """Return what a unit of each bias does to the whitened inertial rows (K - 1, 15, 6)."""
-        rows, n = self._linear.between.jacobian, self._linear.problem.extras.state_dim
-        # A bias at the begin acts on the motion and on the bias at the end, that at the end on the
-        # latter alone, the other way round.
-        begin, end = slice(ACCEL_BIAS.start, STATE_DIM), slice(n + ACCEL_BIAS.start, n + STATE_DIM)
-        return np.asarray(rows[:, :STATE_DIM, begin] + rows[:, :STATE_DIM, end])
+        return columns_of_biases(
+            self._linear.between.jacobian, self._linear.problem.extras.state_dim
+        )
 
     def _modes(self) -> Iterator[tuple[str, Mode]]:
         """Yield clocks of aids that move fast enough to tell, and what aids may err in besides."""

@@ -77,11 +77,34 @@ class PieceSearch:
         return joined_of(found)
 
     def beside(self, judge: Judge, channels: Channels, known: Sequence[Fault]) -> Beside:
-        """Return what the first piece says of what there may be beside: it is so in all."""
+        """Return what there may be beside; what instruments do not state is so in all pieces.
+
+        The first one says that. Of jumps that may be chance the likeliest of all pieces counts.
+        What goes on to the end of its piece does so to that of the mission.
+        """
         keyframe_s = judge.linear.problem.keyframe_s
-        piece = pieces_of(keyframe_s, self._settings.piece_s)[0]
-        look = Look(judge, channels, self._settings, (piece.begin, piece.end))
-        return look.beside(parts_of(known, piece, keyframe_s))
+        first, *later = (
+            (piece, Look(judge, channels, self._settings, (piece.begin, piece.end)))
+            for piece in pieces_of(keyframe_s, self._settings.piece_s)
+        )
+        piece, look = first
+        found = look.beside(parts_of(known, piece, keyframe_s))
+        n = len(keyframe_s)
+        instead = [_lasting(one, piece, n) for one in found.instead]
+        possible = [replace(one, end=n) for one in found.possible]
+        for piece, look in later if not instead else []:
+            others = look.possible(parts_of(known, piece, keyframe_s))
+            possible += [replace(one, end=n) for one in others]
+        likeliest = sorted(possible, key=lambda one: -one.chi_sq)[:1]
+        return found._replace(instead=instead, possible=likeliest)
+
+
+def _lasting(one: Fault, piece: Piece, n: int) -> Fault:
+    """Return a fault that goes on to the last of ``n`` keyframes if it does to its piece's end."""
+    if one.end < piece.end:
+        return one
+    rivals = tuple(_lasting(rival, piece, n) for rival in one.rivals)
+    return replace(one, end=n, rivals=rivals)
 
 
 def _has_moved(by_n: Array, variance: Array) -> bool:

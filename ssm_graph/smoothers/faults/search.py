@@ -47,7 +47,7 @@ SAME_ONSET = 4.0
 """Chi-square by which another onset of a ramp may be worse, two sigmas, and is freed, too."""
 POSSIBLE = 11.0
 """Chi-square from which on a jump of a gyro may be: of three axes and all times one is above it by
-chance in 30 missions. At tactical grade 0.05 deg/s over 200 s without fixes has 11 to 31, and bends
+chance in 30 pieces. At tactical grade 0.05 deg/s over 200 s without fixes has 11 to 31, and bends
 the way by ten of its sigmas."""
 SAME_STRETCH = 0.5
 SAME_ANSWER_SIGMAS = 1.0
@@ -134,10 +134,16 @@ class Look:
         jump, *others = [as_large_as_alone(one, left, []) for one in (jump, *rivals)]
         return Beside(found, [replace(jump, rivals=tuple(others))], [])
 
+    def possible(self, known: Sequence[Fault]) -> list[Fault]:
+        """Return a jump that may be beside what was found, none that is unlikely."""
+        freed = with_rivals(known)
+        judge = self._judge.with_steady_biases()
+        return self._possible_in(judge.on(self._grid(freed)).with_freed(freed))
+
     def _possible_in(self, left: Judged) -> list[Fault]:
-        """Return the likeliest jump of one gyro that goes on to the end of the mission."""
+        """Return the likeliest jump of one gyro that goes on to the end of the piece."""
         edges, found = left.grid.edges, []
-        if left.grid.n_blocks < 2 or edges[-1] < len(self._keyframe_s):
+        if left.grid.n_blocks == 1:
             return []
         for one in self.hypotheses:
             if one.channel == IMU and len(one.sigma) == 1:

@@ -32,6 +32,7 @@ from ssm_graph.smoothers.faults.columns import (
     SCALE,
     TREND_S,
     Channels,
+    columns_of_biases,
     linear_of_steps,
 )
 from ssm_graph.smoothers.faults.hypotheses import Course
@@ -80,8 +81,6 @@ class FaultWatch:
         """The last of what was found: what may be instead of that, which is judged no more"""
         self._possible: list[Fault] = []
         """What may be chance: nothing is taken off, the sigmas allow for it"""
-        self._on_possible = np.zeros((problem.n_keyframes - 1, 15, 0))
-        """(K - 1, 15, P) what it does to the whitened inertial rows"""
         self._contradicted: list[DetectedFault] = []
         """What the inertial data contradicted before that was allowed for"""
         self._is_statement_judged = self._is_let_back = self._is_unwound = False
@@ -122,10 +121,12 @@ class FaultWatch:
                 return Changed(linearizer, states, weights, aid_weights)
         if self._is_done or not (is_near or self._is_slow(update_sigmas)):
             return None
-        return (yield from self._search_steps(linearizer, states))
+        return (yield from self._search_steps(linearizer, states, is_near=is_near))
 
-    def _search_steps(self, linearizer: GraphLinearizer, states: States) -> Steps[Changed | None]:
-        """Search at the states, and free what is found."""
+    def _search_steps(
+        self, linearizer: GraphLinearizer, states: States, *, is_near: bool
+    ) -> Steps[Changed | None]:
+        """Search at the states, and free what is found; far from an answer nothing ends it."""
         assert self._bare is not None
         assert self._search is not None
         self._n_looks += 1
@@ -142,6 +143,8 @@ class FaultWatch:
         known = self._sized(states)[: len(self._found) - len(self._undecided)]
         found = yield from self._search.find_steps(judge, channels, known)
         is_same = same_faults([*found, *self._undecided], self._found, self._problem.keyframe_s)
+        if is_same and not is_near:
+            return None
         if is_same and not self._is_let_back:
             self._is_let_back, n_found = True, len(found)
             found = let_back(found)
@@ -175,13 +178,10 @@ class FaultWatch:
         """Keep what there may be beside the faults; return whether the answer stays as it is."""
         self._is_statement_judged = True
         self._unstated, self._undecided, self._possible = found
-        between, time_s = judge.channels.between, self._problem.keyframe_s
-        of_imu = {IMU: between}
-        self._on_possible = _columns(self._possible, of_imu, np.arange(len(between)), time_s)
         if self._unstated is None:
             return not self._undecided
         fit = inertial_fit(judge.linear.inertial_rows(), judge.linear.solution)
-        self._contradicted = noisier_than_stated(fit, time_s)
+        self._contradicted = noisier_than_stated(fit, self._problem.keyframe_s)
         self._problem = replace(self._problem, chain=self._unstated.widened(self._problem.chain))
         self._bare = GraphLinearizer(self._problem)
         return False
@@ -189,12 +189,9 @@ class FaultWatch:
     def _is_slow(self, update_sigmas: float) -> bool:
         """Return whether passes come no nearer: what is off bends the answer beyond their reach."""
         is_slower = update_sigmas > SLOW * self._last_update
-        self._n_slow = self._n_slow + 1 if is_slower else 0
+        self._n_slow = (self._n_slow + 1) % SLOW_PASSES if is_slower else 0
         self._last_update = update_sigmas
-        if self._n_slow < SLOW_PASSES:
-            return False
-        self._n_slow = 0
-        return True
+        return is_slower and self._n_slow == 0
 
     def allowing_steps(
         self, linearizer: GraphLinearizer, states: States
@@ -203,9 +200,11 @@ class FaultWatch:
         if not self._possible:
             return linearizer, states
         sigma = np.concatenate([one.hypothesis.sigma for one in self._possible])
-        freed = linearizer.freed or Freed.nothing(self._problem)
-        wide = freed.with_between(sigma, self._on_possible)
-        extras = linearizer.problem.extras.without({FAULTS})
+        freed, extras = linearizer.freed or Freed.nothing(self._problem), linearizer.problem.extras
+        between = columns_of_biases(linearizer.inertial_rows(states), extras.state_dim)
+        at = np.arange(len(between)), self._problem.keyframe_s
+        wide = freed.with_between(sigma, _columns(self._possible, {IMU: between}, *at))
+        extras = extras.without({FAULTS})
         problem = replace(linearizer.problem, extras=Extras((*extras.blocks, wide.variable)))
         constants = np.concatenate([states.constants, np.zeros(len(sigma))])
         linearizer, states = GraphLinearizer(problem, wide), states._replace(constants=constants)

@@ -245,12 +245,14 @@ def informative(
     return says, _noisy(sensor, t, np.where(freed, np.inf, most), time_s, dim=dim)
 
 
-def noisy_or_compared(noisy: DetectedFault, beams: Beams) -> DetectedFault:
+def noisy_or_compared(noisy: DetectedFault, beams: Beams, time_s: Array) -> DetectedFault:
     """Return the finding of a noisy DVL, or of what it is compared with, if its beams agree.
 
     What no velocity makes of more than three beams is their noise alone, whatever the vehicle does.
+    Only the beams of the finding's stretch are asked, by their times (M,), s.
     """
-    parity = beside_median(parity_of(beams)) / np.sqrt(BESIDE_MEDIAN)
+    own = beams.take((noisy.begin_s <= time_s) & (time_s <= noisy.end_s))
+    parity = beside_median(parity_of(own)) / np.sqrt(BESIDE_MEDIAN)
     square = float(np.median(parity**2)) / float(chi2.isf(0.5, 1)) if len(parity) else np.inf
     if len(parity) < FEWEST or square > NOTABLE_SQUARE:
         return noisy

@@ -143,7 +143,7 @@ def check_integrity(
     trajectory = estimate.trajectory
     parts = [
         witness(replace(mission, imu=imu), start, bounds)
-        for imu, start in _pieces(mission.imu, estimate)
+        for imu, start in _pieces(mission.imu.calibrated, estimate)
     ]
     w = joined(parts)
     p_n = mission.frame.p_n_from_geodetic(trajectory.lat, trajectory.lon, trajectory.height)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -159,6 +159,7 @@ def witness(mission: Mission, start: InitialState, bounds: WitnessBounds | None 
     own = bounds or WitnessBounds()
     if len(mission.dvl.of_ground().time_s) < 2:
         raise DataError("witness: expected two pings off the ground or more, got fewer")
+    mission = replace(mission, imu=mission.imu.calibrated)
     stamps = mission.imu.time_s[mission.imu.time_s >= start.time_s]
     for at in np.flatnonzero(np.diff(stamps) > LONGEST_GAP_S):
         raise DataError(

@@ -63,6 +63,16 @@ def test_the_truth_is_inside_and_fixes_hold_the_set(simulated: SimulatedMission)
     assert w.half_widths[-1, 0] < 3.5
 
 
+def test_stamps_that_are_late_as_stated_change_nothing(simulated: SimulatedMission) -> None:
+    """The set is that of stamps on time, to the end of the inertial data."""
+    mission, imu = simulated.mission, simulated.mission.imu
+    known = replace(imu.calibration, time_offset_s=0.5)
+    imu = replace(imu, start_s=imu.start_s + 0.5, time_s=imu.time_s + 0.5, calibration=known)
+    w, late = of(mission), of(replace(mission, imu=imu))
+    np.testing.assert_allclose(late.time_s, w.time_s, atol=1e-9)
+    np.testing.assert_allclose(late.half_widths, w.half_widths, rtol=1e-6)
+
+
 def test_bounds_that_are_too_small_are_noticed(simulated: SimulatedMission) -> None:
     """A tenth of a sigma is no bound: readings miss the set at once."""
     w = of(simulated.mission, WitnessBounds(sigmas=0.1, velocity_m_per_s=1e-4, speed_share=1e-4))
