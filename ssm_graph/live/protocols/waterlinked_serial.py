@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from ssm_graph.live.protocols.decoder import RefusedError, shown
-from ssm_graph.live.protocols.framing import ObjectFramer, SentenceFramer
+from ssm_graph.live.protocols.framing import ObjectFramer
 from ssm_graph.live.protocols.nmea_fields import required_number
 
 MAX_LINE: Final = 512
@@ -37,6 +37,8 @@ _NOT_READ: Final = frozenset("vwcanNT")
 """Answers to commands."""
 _OLD: Final = frozenset("xt")
 """Kinds of the first version."""
+_NEW: Final = frozenset("zu")
+"""Kinds of the second alone, of which one comes with every ping."""
 _MANY_OLD: Final = 10
 """Without one of the second between: nothing else comes."""
 _SIN, _COS = math.sin(math.pi / 8.0) / math.sqrt(2.0), math.cos(math.pi / 8.0)
@@ -83,15 +85,16 @@ class ReportFramer:
     def __init__(self, refuse: Callable[[str], None], *, max_length: int) -> None:
         self._refuse, self._max_length = refuse, max_length - MAX_LINE
         self._objects = ObjectFramer(refuse, max_length=self._max_length)
-        self._lines = SentenceFramer(self._on_long_line, max_length=MAX_LINE)
         self._serial = SerialReports(refuse)
         self._undecided: bytes | None = b""
         self._is_serial = False
+        self._line = b""
+        """The end of the unfinished line"""
 
     @property
     def n_held(self) -> int:
         """Bytes held of what is not complete."""
-        return len(self._undecided or b"") + self._objects.n_held + self._lines.n_held
+        return len(self._undecided or b"") + self._objects.n_held + len(self._line)
 
     def feed(self, data: bytes) -> list[str]:
         """Return the reports that end in ``data``."""
@@ -102,25 +105,28 @@ class ReportFramer:
                 return []
             self._is_serial = begin is not None and b"{" not in data[: begin.end()]
             self._undecided = None
-        was_serial = self._is_serial
-        texts = [] if was_serial else self._objects.feed(data)
-        for line in self._lines.feed(data):
-            if is_sound(line) and not self._is_serial:
-                self._is_serial = True
-                self._objects = ObjectFramer(self._refuse, max_length=self._max_length)
-            if self._is_serial and "{" in line and not _LINE.search(line):
-                self._is_serial = False
-            if self._is_serial:
-                texts += self._serial.feed(line)
-            elif was_serial:
-                texts += self._objects.feed(line.encode("latin-1") + b"\n")
-        if was_serial and not self._is_serial:
-            texts += self._objects.feed(self._lines.rest)
-        return texts
+        return [text for part in data.splitlines(keepends=True) for text in self._take(part)]
 
-    def _on_long_line(self, _: str) -> None:
-        """Expect JSON: what is that long is no line of the serial protocol."""
-        self._is_serial = False
+    def _take(self, part: bytes) -> list[str]:
+        """Return the reports that end in what has come of a line."""
+        texts = [] if self._is_serial else self._objects.feed(part)
+        self._line += part
+        is_ended = part.endswith((b"\r", b"\n"))
+        line = self._line.strip().decode("latin-1")
+        is_object = is_ended and "{" in line and not _LINE.search(line)
+        if self._is_serial and (is_object or len(line) > MAX_LINE):
+            self._is_serial = False
+            texts = self._objects.feed(self._line)
+        if not is_ended:
+            self._line = self._line[-MAX_LINE:]
+            return texts
+        self._line = b""
+        if not self._is_serial and is_sound(line):
+            if self._objects.n_held > len(b"\n"):
+                self._refuse("expected the end of a JSON object, got the serial protocol")
+            self._objects = ObjectFramer(self._refuse, max_length=self._max_length)
+            self._is_serial = True
+        return texts + (self._serial.feed(line) if self._is_serial and line else [])
 
 
 class SerialReports:
@@ -156,8 +162,8 @@ class SerialReports:
             return []
 
     def _read(self, kind: str, fields: list[str]) -> list[str]:
-        self._n_old = self._n_old + 1 if kind in _OLD else 0
-        if self._n_old == _MANY_OLD:
+        self._n_old = 0 if kind in _NEW else self._n_old + (kind in _OLD)
+        if kind in _OLD and self._n_old == _MANY_OLD:
             raise RefusedError(
                 "wrx and wrt come alone, which say no speed along a beam; set the output of the "
                 "instrument to WL - Serial V2 (wcp,3)"
