@@ -28,9 +28,9 @@ N_BEAMS: Final = 4
 _UNDECIDED: Final = 4096
 """Bytes without a begin of either protocol, after which JSON is expected."""
 _LINE = re.compile(r"\bwr([a-zA-Z])((?:,[^,*]*)*)\*([0-9A-Fa-f]{2})\Z", re.ASCII)
-_BEGIN: Final = re.compile(rb"(?:\A|[\r\n])[^{\r\n]{0,40}\bwr[a-zA-Z],")
+_BEGIN: Final = re.compile(rb"(?:\A|[\r\n])[^{\r\n]{0,120}\bwr[a-zA-Z],")
 SERIAL: Final = re.compile(
-    rb"(?:\A|[\r\n])[^{\r\n]{0,40}\bwr[zsuxt],[^*\r\n]{1,400}\*[0-9A-Fa-f]{2}"
+    rb"(?:\A|[\r\n])[^{\r\n]{0,120}\bwr[zsuxt],[^*\r\n]{1,400}\*[0-9A-Fa-f]{2}"
 )
 """A recording of the serial protocol has it."""
 _NOT_READ: Final = frozenset("vwcanNT")
@@ -47,6 +47,8 @@ _FORGET: Final = 0.9
 """Of a ping's misfit, what counts at the next one."""
 _CLEAR: Final = 2e-4
 """(m/s)²: rounding to a millimetre per second leaves a hundredth of it."""
+_TIMES: Final = 4.0
+"""As much better does the other order agree; noise of the velocity alone favours neither."""
 
 
 def crc8(data: bytes) -> int:
@@ -142,8 +144,10 @@ class SerialReports:
         """Whether they went with a report."""
         self._n_old = 0
         """Lines of the first version since one of the second."""
-        self._misfit_after = self._misfit_before = 0.0
+        self._misfits = [0.0, 0.0]
         """Of transducers after their velocity, and before it, (m/s)²."""
+        self._is_before = False
+        """Whether transducers come before the velocity that they belong to."""
 
     def feed(self, line: str) -> list[str]:
         """Return the reports that a line completes."""
@@ -200,19 +204,15 @@ class SerialReports:
         self._is_used = True
         return [_report(self._head, self._beams)]
 
-    @property
-    def _is_before(self) -> bool:
-        """Whether transducers come before the velocity that they belong to."""
-        return self._misfit_after - self._misfit_before > _CLEAR
-
     def _compare(self, head: Mapping[str, Any]) -> None:
         """Take note of which of two velocities agrees with what transducers said between them."""
         assert self._head is not None
         misfits = [_misfit(one, self._beams) for one in (self._head, head)]
         if all(map(math.isfinite, misfits)):
-            after, before = misfits
-            self._misfit_after = _FORGET * self._misfit_after + after
-            self._misfit_before = _FORGET * self._misfit_before + before
+            was = self._misfits
+            self._misfits = [_FORGET * old + new for old, new in zip(was, misfits, strict=True)]
+            own, other = self._misfits[self._is_before], self._misfits[not self._is_before]
+            self._is_before ^= own > _CLEAR + _TIMES * other
 
 
 _GROUND: Final = (
