@@ -168,6 +168,20 @@ def test_of_two_receivers_that_are_not_told_apart_no_sigmas_are_taken(epoch: str
     assert "tag block" in text
 
 
+def test_the_source_of_a_damaged_tag_block_is_not_believed() -> None:
+    """The position of A, damaged to be of B, does not get the sigmas of B."""
+    gga = "GPGGA,120000.00,6327.0000,N,01024.0000,E,4,12,0.8,20.50,M,40.25,M,,"
+    gst = "GPGST,120000.00,1.1,0.3,0.2,45.0,0.2,0.2,0.2"
+    block = f"\\s:B*{checksum('s:B')}\\".encode()
+    for damaged, east in ((block, 0.2), (block.replace(b"*", b"*0")[:-2] + b"\\", 4.0)):
+        decoder = NmeaDecoder()
+        data = block + sentence(gst) + damaged + sentence(gga)
+        (fix,) = decoder.feed(data, arrival_s=NOON_S) + decoder.take_waiting()
+        assert isinstance(fix, Fix)
+        assert fix.sigma_enu[0] == east
+        assert decoder.n_refused == (damaged != block)
+
+
 def test_a_gns_for_each_system_of_satellites() -> None:
     """The first has the place; the others are no receivers without a fix."""
     place = "6326.0000,N,01024.0000,E,AAN,14,0.9,5.5,6.5,,"

@@ -87,7 +87,6 @@ def recorded() -> list[dict[str, Any]]:
         return [csv_report(row) for row in csv.DictReader(file)]
 
 
-@needs_logs
 def test_what_other_writers_make_of_a_report() -> None:
     """Nothing where a beam or the altitude is not valid, numbers for truth, whole floats."""
     lacking = with_beams(velocity=None, beam_valid=False)
@@ -123,6 +122,7 @@ def test_tracking_mode_of_newer_software() -> None:
     assert read({"command": "get_config"}) == ([], [])
 
 
+@needs_logs
 def test_sign_of_the_instrument(recorded: list[dict[str, Any]]) -> None:
     """Transducer velocities are along beams that point down, out of the transducer."""
     pings, refused = read(*recorded)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -267,6 +267,33 @@ def test_after_a_kill_the_instrument_is_known_by_its_socket(tmp_path: Path) -> N
     assert [one.kind for one in places.known()] == [DepthReading]
     assert own is not None
     own.close()
+
+
+def test_places_that_a_full_disk_did_not_take_are_written_later() -> None:
+    """Once it takes them, and no more often than they change."""
+    clock, noted = Steady(), list[tuple[Known, ...]]()
+    inputs = [InputConfig("depth", Endpoint(Transport.UDP, LOOPBACK, 0), JsonDecoder)]
+
+    def note(known: Iterable[Known]) -> str | None:
+        noted.append(tuple(known))
+        return "no space" if len(noted) < 3 else None
+
+    with SocketHub(
+        inputs, steady_s=clock, wall_s=lambda: WALL_S + clock.now_s, note_places=note
+    ) as hub:
+        receiver = Receiver(hub)
+        (source,) = hub.inputs
+        assert isinstance(source, UdpInput)
+        own = UdpSender(source.port)
+        for k in range(SETTLED):
+            clock.now_s += 0.1
+            own.send(depth(clock, 5.0))
+            receiver.until(lambda n=k: len(depths(receiver)) == n + 1)  # type: ignore[misc]
+        for _ in range(5):
+            clock.now_s += REMEMBER_S
+            receiver.poll()
+        own.close()
+    assert [[one.kind for one in known] for known in noted] == 3 * [[DepthReading]]
 
 
 def test_a_place_that_is_called_no_more_keeps_nobody_out() -> None:

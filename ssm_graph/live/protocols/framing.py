@@ -76,11 +76,6 @@ class SentenceFramer:
         """Bytes of the unfinished line, at most ``max_length``."""
         return len(self._rest)
 
-    @property
-    def rest(self) -> bytes:
-        """The unfinished line."""
-        return self._rest
-
     def feed(self, data: bytes) -> list[str]:
         """Return the lines that end in ``data``, without space around, not empty."""
         *ended, rest = _LINE_END.split(self._rest + data)

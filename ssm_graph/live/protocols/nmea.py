@@ -53,7 +53,7 @@ _MOST_WAITING: Final = 200
 _FEW_LETTERS: Final = 16
 """Shorter printable pieces are of binary frames that a line end within cuts up."""
 _LIKE_SENTENCE = re.compile(r"[$!]?[A-Z]{2}[A-Z0-9]{2,8},")
-_TAG_BLOCK = re.compile(r"\\([^\\]*)\*([0-9A-Fa-f]{2})\\\Z", re.ASCII)
+_TAG_BLOCK = re.compile(r"\\([\x00-\x5b\x5d-\x7f]*)\*([0-9A-Fa-f]{2})\\\Z", re.ASCII)
 _TAG_SOURCE = re.compile(r"(?:\A|,)s:([^,]*)")
 
 PRESSURE_SENTENCES: Final = frozenset(
@@ -170,16 +170,13 @@ class NmeaDecoder(Decoder):
             if not (is_text and text.startswith(("!", "\\"))):  # which AIS is
                 self._pass_over(text)
             return []
-        lead = text[:begin].rstrip("$")
-        tag = _TAG_BLOCK.search(lead)
-        if lead:
-            self._pass_over(self._without_tag(lead, tag))
+        lead, source = self._without_tag(text[:begin].rstrip("$"))
+        self._pass_over(lead)
         name, *fields = split_sentence(text[begin + 1 :])
         self._n_other = 0
         self._told.discard("other")
         kind = name if name.startswith("P") else name[-3:]
-        source = tag and _TAG_SOURCE.search(tag[1])
-        speaker = Speaker(source[1] if source else "", name.removesuffix(kind))
+        speaker = Speaker(source, name.removesuffix(kind))
         messages = self._read(speaker, kind, fields, arrival_s)
         self._watch(kind, arrival_s, is_read=messages is not None)
         return messages or []
@@ -203,13 +200,16 @@ class NmeaDecoder(Decoder):
             return [DepthReading(self._stamper.stamp(None, arrival_s), depth)]
         return None
 
-    def _without_tag(self, lead: str, found: re.Match[str] | None) -> str:
-        """Return what stands before a sentence without a tag block."""
+    def _without_tag(self, lead: str) -> tuple[str, str]:
+        """Return what stands before a sentence without a tag block, and the source that it has."""
+        found = _TAG_BLOCK.search(lead)
         if not found:
-            return lead
-        if found[1].isascii() and checksum(found[1]) != found[2].upper():
-            self._refuse(f"expected tag block checksum {checksum(found[1])}, got {found[2]}")
-        return lead[: found.start()]
+            return lead, ""
+        source = _TAG_SOURCE.search(found[1])
+        if (expected := checksum(found[1])) != found[2].upper():
+            self._refuse(f"expected tag block checksum {expected}, got {found[2]}")
+            source = None
+        return lead[: found.start()], source[1] if source else ""
 
     def _pass_over(self, text: str) -> None:
         """Refuse what was to be a sentence or a text; count what is binary."""

@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from ssm_graph.live.protocols.decoder import RefusedError, shown
-from ssm_graph.live.protocols.framing import ObjectFramer, SentenceFramer
+from ssm_graph.live.protocols.framing import ObjectFramer
 from ssm_graph.live.protocols.nmea_fields import required_number
 
 MAX_LINE: Final = 512
@@ -28,15 +28,17 @@ N_BEAMS: Final = 4
 _UNDECIDED: Final = 4096
 """Bytes without a begin of either protocol, after which JSON is expected."""
 _LINE = re.compile(r"\bwr([a-zA-Z])((?:,[^,*]*)*)\*([0-9A-Fa-f]{2})\Z", re.ASCII)
-_BEGIN: Final = re.compile(rb"(?:\A|[\r\n])[^{\r\n]{0,40}\bwr[a-zA-Z],")
+_BEGIN: Final = re.compile(rb"(?:\A|[\r\n])[^{\r\n]{0,120}\bwr[a-zA-Z],")
 SERIAL: Final = re.compile(
-    rb"(?:\A|[\r\n])[^{\r\n]{0,40}\bwr[zsuxt],[^*\r\n]{1,400}\*[0-9A-Fa-f]{2}"
+    rb"(?:\A|[\r\n])[^{\r\n]{0,120}\bwr[zsuxt],[^*\r\n]{1,400}\*[0-9A-Fa-f]{2}"
 )
 """A recording of the serial protocol has it."""
 _NOT_READ: Final = frozenset("vwcanNT")
 """Answers to commands."""
 _OLD: Final = frozenset("xt")
 """Kinds of the first version."""
+_NEW: Final = frozenset("zu")
+"""Kinds of the second alone, of which one comes with every ping."""
 _MANY_OLD: Final = 10
 """Without one of the second between: nothing else comes."""
 _SIN, _COS = math.sin(math.pi / 8.0) / math.sqrt(2.0), math.cos(math.pi / 8.0)
@@ -45,6 +47,8 @@ _FORGET: Final = 0.9
 """Of a ping's misfit, what counts at the next one."""
 _CLEAR: Final = 2e-4
 """(m/s)²: rounding to a millimetre per second leaves a hundredth of it."""
+_TIMES: Final = 4.0
+"""As much better does the other order agree; noise of the velocity alone favours neither."""
 
 
 def crc8(data: bytes) -> int:
@@ -83,15 +87,16 @@ class ReportFramer:
     def __init__(self, refuse: Callable[[str], None], *, max_length: int) -> None:
         self._refuse, self._max_length = refuse, max_length - MAX_LINE
         self._objects = ObjectFramer(refuse, max_length=self._max_length)
-        self._lines = SentenceFramer(self._on_long_line, max_length=MAX_LINE)
         self._serial = SerialReports(refuse)
         self._undecided: bytes | None = b""
         self._is_serial = False
+        self._line = b""
+        """The end of the unfinished line"""
 
     @property
     def n_held(self) -> int:
         """Bytes held of what is not complete."""
-        return len(self._undecided or b"") + self._objects.n_held + self._lines.n_held
+        return len(self._undecided or b"") + self._objects.n_held + len(self._line)
 
     def feed(self, data: bytes) -> list[str]:
         """Return the reports that end in ``data``."""
@@ -102,25 +107,28 @@ class ReportFramer:
                 return []
             self._is_serial = begin is not None and b"{" not in data[: begin.end()]
             self._undecided = None
-        was_serial = self._is_serial
-        texts = [] if was_serial else self._objects.feed(data)
-        for line in self._lines.feed(data):
-            if is_sound(line) and not self._is_serial:
-                self._is_serial = True
-                self._objects = ObjectFramer(self._refuse, max_length=self._max_length)
-            if self._is_serial and "{" in line and not _LINE.search(line):
-                self._is_serial = False
-            if self._is_serial:
-                texts += self._serial.feed(line)
-            elif was_serial:
-                texts += self._objects.feed(line.encode("latin-1") + b"\n")
-        if was_serial and not self._is_serial:
-            texts += self._objects.feed(self._lines.rest)
-        return texts
+        return [text for part in data.splitlines(keepends=True) for text in self._take(part)]
 
-    def _on_long_line(self, _: str) -> None:
-        """Expect JSON: what is that long is no line of the serial protocol."""
-        self._is_serial = False
+    def _take(self, part: bytes) -> list[str]:
+        """Return the reports that end in what has come of a line."""
+        texts = [] if self._is_serial else self._objects.feed(part)
+        self._line += part
+        is_ended = part.endswith((b"\r", b"\n"))
+        line = self._line.strip().decode("latin-1")
+        is_object = is_ended and "{" in line and not _LINE.search(line)
+        if self._is_serial and (is_object or len(line) > MAX_LINE):
+            self._is_serial = False
+            texts = self._objects.feed(self._line)
+        if not is_ended:
+            self._line = self._line[-MAX_LINE:]
+            return texts
+        self._line = b""
+        if not self._is_serial and is_sound(line):
+            if self._objects.n_held > len(b"\n"):
+                self._refuse("expected the end of a JSON object, got the serial protocol")
+            self._objects = ObjectFramer(self._refuse, max_length=self._max_length)
+            self._is_serial = True
+        return texts + (self._serial.feed(line) if self._is_serial and line else [])
 
 
 class SerialReports:
@@ -136,8 +144,10 @@ class SerialReports:
         """Whether they went with a report."""
         self._n_old = 0
         """Lines of the first version since one of the second."""
-        self._misfit_after = self._misfit_before = 0.0
+        self._misfits = [0.0, 0.0]
         """Of transducers after their velocity, and before it, (m/s)²."""
+        self._is_before = False
+        """Whether transducers come before the velocity that they belong to."""
 
     def feed(self, line: str) -> list[str]:
         """Return the reports that a line completes."""
@@ -156,8 +166,8 @@ class SerialReports:
             return []
 
     def _read(self, kind: str, fields: list[str]) -> list[str]:
-        self._n_old = self._n_old + 1 if kind in _OLD else 0
-        if self._n_old == _MANY_OLD:
+        self._n_old = 0 if kind in _NEW else self._n_old + (kind in _OLD)
+        if kind in _OLD and self._n_old == _MANY_OLD:
             raise RefusedError(
                 "wrx and wrt come alone, which say no speed along a beam; set the output of the "
                 "instrument to WL - Serial V2 (wcp,3)"
@@ -194,19 +204,15 @@ class SerialReports:
         self._is_used = True
         return [_report(self._head, self._beams)]
 
-    @property
-    def _is_before(self) -> bool:
-        """Whether transducers come before the velocity that they belong to."""
-        return self._misfit_after - self._misfit_before > _CLEAR
-
     def _compare(self, head: Mapping[str, Any]) -> None:
         """Take note of which of two velocities agrees with what transducers said between them."""
         assert self._head is not None
         misfits = [_misfit(one, self._beams) for one in (self._head, head)]
         if all(map(math.isfinite, misfits)):
-            after, before = misfits
-            self._misfit_after = _FORGET * self._misfit_after + after
-            self._misfit_before = _FORGET * self._misfit_before + before
+            was = self._misfits
+            self._misfits = [_FORGET * old + new for old, new in zip(was, misfits, strict=True)]
+            own, other = self._misfits[self._is_before], self._misfits[not self._is_before]
+            self._is_before ^= own > _CLEAR + _TIMES * other
 
 
 _GROUND: Final = (

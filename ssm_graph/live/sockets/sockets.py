@@ -187,8 +187,10 @@ class SocketHub:
             return
         self._noted_s, known = now.steady_s, self._places.known()
         if known != self._noted:
-            self._noted, problem = known, self._note_places(known)
-            if problem is not None:
+            problem = self._note_places(known)
+            if problem is None:
+                self._noted = known
+            else:  # tried again and again
                 self._events.note("disk", "disk", problem, Severity.ERROR)
 
     def _look_for_a_standstill(self, now: Now, timeout_s: float) -> None:
