@@ -110,17 +110,25 @@ def test_a_velocity_that_is_a_little_off_its_beams_turns_no_order() -> None:
     np.testing.assert_allclose(speeds(found), speed, atol=6e-4)
 
 
-def test_damage_costs_a_beam_or_a_ping() -> None:
-    """A transducer whose line is damaged is missing; without the velocity the ping is."""
+def test_damage_costs_its_ping() -> None:
+    """Whether a transducer's line is damaged or the velocity's."""
     lines, speed = pings(6)
     lines[1] = lines[1].replace(b"wru,2,", b"wru,2,9")
     lines[3] = lines[3].replace(b"wrz,", b"wrz,9")
     found, refused = fed(b"".join(lines))
     assert len(refused) == 2
     assert "expected checksum" in refused[0]
-    expected = np.delete(speed, 3, axis=0)
-    expected[1, 2] = math.nan
-    np.testing.assert_allclose(speeds(found), expected, atol=6e-4)
+    np.testing.assert_allclose(speeds(found), np.delete(speed, [1, 3], axis=0), atol=6e-4)
+
+
+def test_no_ping_is_made_of_two() -> None:
+    """Bytes that are lost from amid one ping to amid the next leave no mixture of both."""
+    lines, speed = pings(8)
+    data = b"".join(lines)
+    for begin in range(len(lines[0]), 2 * len(lines[0]), 7):
+        found, _ = fed(data[:begin] + data[begin + len(lines[0]) :])
+        for one in speeds(found):
+            assert np.nanmax(np.abs(speed - one), axis=1).min() < 6e-4
 
 
 @pytest.mark.parametrize(

@@ -132,7 +132,10 @@ class ReportFramer:
 
 
 class SerialReports:
-    """Lines to reports; one that is damaged costs its transducer, or its ping."""
+    """Lines to reports; one that is damaged costs its ping.
+
+    It may be the end of one ping and the begin of the next, with all between lost.
+    """
 
     def __init__(self, refuse: Callable[[str], None]) -> None:
         self._refuse = refuse
@@ -163,6 +166,7 @@ class SerialReports:
             return self._read(kind, fields)
         except RefusedError as error:
             self._refuse(str(error))
+            self._head, self._beams, self._is_used = None, {}, False
             return []
 
     def _read(self, kind: str, fields: list[str]) -> list[str]:
