@@ -201,12 +201,15 @@ def _renewed(rows: _Rows, solution: ChainSolution, weights: TagWeights) -> TagWe
 
 
 def widened(problem: TagProblem, found: TagPass) -> TagProblem:
-    """Return the problem with sigmas that are not below what residuals show, each anchor's own."""
+    """Return the problem with sigmas that are not below what residuals show, each anchor's own.
+
+    Ranges that place no anchor have no residuals: their sigmas stay.
+    """
     range_sigma = problem.range_sigma.copy()
-    error = found.ranges.error * range_sigma
     for j in range(len(found.values.anchors)):
         own = problem.anchor == j
-        range_sigma[own] = np.fmax(range_sigma[own], robust_rms(error[own]))
+        error = found.ranges.error[own] * range_sigma[own]
+        range_sigma[own] = np.fmax(range_sigma[own], robust_rms(error))
     seen = np.abs(found.sightings.error[found.sightings.error != 0.0])
     wider = max(SIGMA_OF_MEDIAN * float(np.median(seen)), 1.0)
     return replace(problem, range_sigma=range_sigma, seen_sigma=wider * problem.seen_sigma)

@@ -10,6 +10,7 @@ from factors.so3 import exp
 from ssm_graph.systems.visual_ranges.camera import Camera
 from ssm_graph.systems.visual_ranges.ranges import Ranges, screened_ranges
 from ssm_graph.systems.visual_ranges.similarity3 import umeyama
+from ssm_graph.systems.visual_ranges.tag_path import DENSITY, TagWeights, one_pass, widened
 from ssm_graph.systems.visual_ranges.tag_rows import (
     DIM,
     TagProblem,
@@ -89,6 +90,16 @@ def test_rows_are_the_slopes_of_their_errors() -> None:
     assert n == DIM + 2
     largest = np.abs(wanted).max(axis=1)[:, None]
     np.testing.assert_allclose(made / largest, wanted / largest, atol=1e-6)
+
+
+def test_ranges_that_place_no_anchor_keep_their_sigmas() -> None:
+    """Sightings alone go on."""
+    problem, values = _any_problem()
+    values = values._replace(anchors=np.zeros((0, 3)), biases=np.zeros((4, 0)))
+    weights = TagWeights(np.ones(6), np.ones(4), np.array(DENSITY))
+    found = widened(problem, one_pass(problem, values, weights))
+    np.testing.assert_array_equal(found.range_sigma, problem.range_sigma)
+    assert found.seen_sigma > problem.seen_sigma
 
 
 def _walk(seed: int, last_s: float) -> tuple[TagSightings, Ranges, Array, Array, Array]:
