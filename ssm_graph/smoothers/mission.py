@@ -23,6 +23,10 @@ from ssm_graph.smoothers.settings import SmootherConfig
 AMBIGUOUS_COST = 6.0
 """Another heading whose cost is higher by less than this is as good an explanation (a likelihood
 ratio of about 400)."""
+FAULT_COST = 20.0
+"""What an explanation is charged for each lasting fault that it needs: half of the chi-square of 40
+or so from which on the search believes in one. Of a heading that is wrong by 180 degrees a pull of
+the fixes explains the rest."""
 SAME_HEADING = np.radians(5.0)
 """Headings closer than this, or than three of their sigmas, are one and the same."""
 POOR_HEADING = np.radians(3.0)
@@ -131,13 +135,13 @@ def _choose(estimates: list[Estimate], alignment: Alignment) -> Estimate:
             f"none of {len(alignment.candidates)} start headings led to a finite solution; "
             "check signs, units and axes of [imu] and [dvl], or give [initial]"
         )
-    best = min(estimates, key=lambda estimate: estimate.cost)
+    best = min(estimates, key=_price)
     heading = best.trajectory.roll_pitch_heading[0, 2]
     sigma = float(best.trajectory.attitude_sigma[0, 2])
     rivals = [
         float(np.degrees(other.trajectory.roll_pitch_heading[0, 2]))
         for other in estimates
-        if other.cost - best.cost < AMBIGUOUS_COST
+        if _price(other) - _price(best) < AMBIGUOUS_COST
         and abs(wrap_to_pi(other.trajectory.roll_pitch_heading[0, 2] - heading))
         > max(SAME_HEADING, 3.0 * sigma)
     ]
@@ -159,6 +163,11 @@ def _choose(estimates: list[Estimate], alignment: Alignment) -> Estimate:
             "[initial]"
         )
     return _with_notes(best, (found,))
+
+
+def _price(estimate: Estimate) -> float:
+    """Return the cost of an explanation with that of the faults that it needs."""
+    return estimate.cost + FAULT_COST * sum(one.treatment.is_blame for one in estimate.faults)
 
 
 def _with_notes(estimate: Estimate, notes: tuple[str, ...]) -> Estimate:

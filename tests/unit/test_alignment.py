@@ -12,6 +12,7 @@ import pytest
 from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frames import wrap_to_pi
 from ssm_graph.mission.estimate import Status
+from ssm_graph.mission.fault import DetectedFault, Treatment
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.start.alignment import N_HYPOTHESES, SAFE_HEADING_SIGMA, align
 from ssm_graph.mission.start.measured import body_velocities
@@ -24,7 +25,7 @@ from ssm_graph.simulation import (
     scenario_config,
     simulate,
 )
-from ssm_graph.smoothers.mission import smooth
+from ssm_graph.smoothers.mission import _choose, smooth
 from tests.mission_fixture import make_mission
 
 
@@ -113,6 +114,22 @@ def test_hypotheses_find_the_heading_that_later_fixes_tell() -> None:
     truth = run.truth_at(estimate.trajectory.time_s[:1]).roll_pitch_heading[0, 2]
     error = wrap_to_pi(estimate.trajectory.roll_pitch_heading[0, 2] - truth)
     assert abs(error) < 3.0 * estimate.trajectory.attitude_sigma[0, 2]
+
+
+def test_a_heading_that_needs_a_lie_is_no_rival_of_one_that_needs_none() -> None:
+    """A pull of the fixes explains what a start that is wrong by 180 degrees leaves."""
+    mission = simulated(Grade.TACTICAL, seconds=60.0).mission
+    honest, alignment = smooth(mission), align(without_initial(mission))
+    pull = DetectedFault("GNSS", "from nothing on", 0.0, 60.0, 60.0, 2, Treatment.FREED)
+    turned = honest.trajectory.roll_pitch_heading + np.array([0.0, 0.0, math.pi])
+    trajectory = replace(honest.trajectory, roll_pitch_heading=turned)
+    lying = replace(honest, trajectory=trajectory, cost=honest.cost - 5.0, faults=(pull,))
+    chosen = _choose([lying, honest], alignment)
+    assert not chosen.faults
+    assert chosen.status is honest.status
+    both = _choose([lying, replace(honest, faults=(pull,))], alignment)
+    assert both.status is Status.SUSPECT
+    assert "heading ambiguous" in both.reason
 
 
 def test_what_cannot_be_aligned_is_refused() -> None:
