@@ -9,15 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.systems.visual_ranges.range_fit import (
-    BIAS_M,
-    Fit,
-    Problem,
-    Solution,
-    residuals,
-    search,
-    understated,
-)
+from ssm_graph.systems.visual_ranges.range_fit import BIAS_M, Problem, Solution, polished
 from ssm_graph.systems.visual_ranges.ranges import Indices
 from ssm_graph.systems.visual_ranges.weights import robust_rms
 
@@ -25,8 +17,6 @@ Mask = NDArray[np.bool_]
 
 SQUARE_OF_3_SIGMA: Final = 14.16
 """Quantile of 0.9973 of chi-square with three degrees of freedom."""
-SQUARE_OF_3: Final = 9.0
-"""The same with one."""
 
 
 def contradictions(
@@ -52,39 +42,22 @@ def contradictions(
         names, at.anchor, best.error, at.sigma_m, best.biases,
         stated_m=stated_m, rms_sigmas=rms_sigmas, marked_share=marked_share,
     )  # fmt: skip
-    return told + _halves_apart(problem, names, best)
-
-
-def _halves_apart(problem: Problem, names: tuple[str, ...], best: Solution) -> list[str]:
-    """Return where the halves of the ranges disagree, a sentence each.
-
-    Halves are compared by what both know: by how much worse they fit where a value is held at the
-    answer of all. A half that knows little may end anywhere, at no price, and its sigma there says
-    nothing. The kernel is the one that never lets go, so that ranges which all became longer speak.
-    """
-    whole = search(problem, best.unknowns[None]).unknowns
-    first = problem.places.time_s < np.median(problem.places.time_s)
-    parts = [_part(problem, half) for half in (first, ~first)]
-    ends = [search(part, whole) for part in parts]
-    own = [_anchors(end, len(names)) for end in ends]
-
-    def price(held: Indices) -> float:
-        both = zip(parts, ends, strict=True)
-        return sum(_price(part, whole, end, held) for part, end in both)
-
-    told = []
-    scale = price(np.zeros(1, dtype=np.intp))
-    if scale > SQUARE_OF_3:
-        apart = abs(float(ends[0].unknowns[0, 0] - ends[1].unknowns[0, 0]))
+    first = at.time_s < np.median(at.time_s)
+    halves = [polished(_part(problem, half), best) for half in (first, ~first)]
+    apart = np.log(halves[0].scale / halves[1].scale)
+    sigma = float(np.hypot(halves[0].sigma_log_scale, halves[1].sigma_log_scale))
+    if abs(apart) > 3.0 * sigma:
         told.append(
-            f"the scales of the first and second half differ by {100.0 * apart:.1f} %, "
-            f"{np.sqrt(scale):.1f} sigma"
+            f"the scales of the first and second half differ by {100.0 * abs(apart):.1f} %, "
+            f"{abs(apart) / sigma:.1f} sigma"
         )
     for j, name in enumerate(names):
-        if price(2 + 4 * j + np.arange(3)) > SQUARE_OF_3_SIGMA:
+        way = halves[0].anchors[j] - halves[1].anchors[j]
+        both = halves[0].anchor_covariance(j) + halves[1].anchor_covariance(j)
+        if float(way @ np.linalg.solve(both, way)) > SQUARE_OF_3_SIGMA:
             told.append(
-                f"anchor {name} moves by {np.linalg.norm(own[0][j] - own[1][j]):.2f} m between the "
-                "first and the second half: did it move, or is the antenna not calibrated?"
+                f"anchor {name} moves by {np.linalg.norm(way):.2f} m between the first and the "
+                "second half: did it move, or is the antenna not calibrated?"
             )
     return told
 
@@ -130,19 +103,3 @@ def _part(problem: Problem, kept: Mask) -> Problem:
         drift=problem.drift[rows],
         walk=problem.walk[rows],
     )
-
-
-def _anchors(end: Fit, n_anchors: int) -> Array:
-    """Return anchors (J, 3), from the middle of the path, m."""
-    return end.unknowns[0, 2 : 2 + 4 * n_anchors].reshape(n_anchors, 4)[:, :3]
-
-
-def _price(part: Problem, at: Array, end: Fit, held: Indices) -> float:
-    """Return the deviance that it costs to hold unknowns at ``at`` (1, P) and not as in ``end``.
-
-    Over how many ranges say the same.
-    """
-    fit = search(part, at, held=held)
-    error = residuals(part, end.unknowns)[0][0]
-    weight = part.kernel.weight(error, 0.0, part.places.sigma_m)
-    return float(fit.cost[0] - end.cost[0]) / understated(part, error, weight)

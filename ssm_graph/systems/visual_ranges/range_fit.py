@@ -311,21 +311,13 @@ def solution(
     weight = problem.kernel.weight(error, variance, problem.places.sigma_m)
     modes = slice(problem.n_core, problem.n_core + 3 * problem.drift.shape[1])
     square = at[0, modes] ** 2 + covariance.diagonal()[modes]
-    covariance = covariance * understated(problem, error[0], weight[0])
+    covariance = covariance * problem.kernel.inefficiency(error, problem.places.sigma_m)
+    covariance = covariance * _repeated(problem, weight[0] * error[0])
     cost = float(_cost(problem, at, error)[0])
     found = _outwards(problem, at[0], covariance, (error[0], variance[0], weight[0]), cost)
     if problem.places.arm is not None:
         found = replace(found, arm=at[0, -3:].copy())
     return replace(found, drift_square=float(square.mean())) if square.size else found
-
-
-def understated(problem: Problem, error: Array, weight: Array) -> float:
-    """Return by how much the inverse of the information understates the covariance, 1 or more.
-
-    For errors (M,), m, and weights (M,): a robust kernel's price, and ranges that say the same.
-    """
-    inefficiency = problem.kernel.inefficiency(error, problem.places.sigma_m)
-    return inefficiency * _repeated(problem, weight * error)
 
 
 def _repeated(problem: Problem, pull: Array) -> float:

@@ -23,9 +23,8 @@ from ssm_graph.systems.visual_ranges.ranging import Ranging
 from ssm_graph.systems.visual_ranges.ranging_result import AnchorState
 from ssm_graph.systems.visual_ranges.readers.starloc import read_starloc
 from ssm_graph.systems.visual_ranges.similarity3 import IDENTITY
-from ssm_graph.systems.visual_ranges.simulate import Run, room_path, simulate
+from ssm_graph.systems.visual_ranges.simulate import Run, simulate
 from ssm_graph.systems.visual_ranges.simulated_ranges import RangeFaults
-from ssm_graph.systems.visual_ranges.start import StartState, find_start
 from ssm_graph.systems.visual_ranges.start_study import (
     UNIT_M,
     shape_trial,
@@ -311,28 +310,6 @@ def test_an_adjustment_is_not_sharper_than_the_path_allows() -> None:
     np.testing.assert_allclose(ranging.found.covariance, before, rtol=1e-9)
     ranging.adopt(np.zeros(further.n_extra), 4.0 * before, further)
     np.testing.assert_allclose(ranging.found.covariance, 4.0 * before, rtol=1e-9)
-
-
-def test_a_half_that_knows_little_does_not_contradict() -> None:
-    """It ends 3 m away, as sharp by its own sigma as if it knew; an anchor that moved does."""
-    run = Run("room", 1000, 60.0)
-    sequence = simulate(run).sequence
-    ranges, anchors = sequence.ranges, sequence.anchor_truth_m
-    assert anchors is not None
-    ranges = ranges.rows(ranges.time_s <= 18.0)
-    camera = room_path(run.seed).place(ranges.time_s)
-    zero, velocity = np.zeros_like(camera), np.gradient(camera, ranges.time_s, axis=0)
-    away = np.linalg.norm(camera - anchors[0], axis=1)
-    moved = np.linalg.norm(camera - anchors[0] - np.array([0.7, -0.7, 0.0]), axis=1) - away
-    late = ranges.time_s > np.median(ranges.time_s)
-    states = []
-    for measured in (ranges.range_m, ranges.range_m + np.where(late, moved, 0.0)):
-        places = Places(
-            camera / UNIT_M, velocity / UNIT_M, zero, zero, ranges.anchor, measured,
-            ranges.sigma_m, ranges.time_s,
-        )  # fmt: skip
-        states.append(find_start(places, ranges.names, turned_rad=1.0).state)
-    assert states == [StartState.COARSE, StartState.REFUSED]
 
 
 @pytest.mark.slow
