@@ -275,9 +275,13 @@ class Lengths(NamedTuple):
     spread: Array
     """(M,) the posterior variance ``H P H'`` alone, summed over the components"""
 
-    def telling(self, weights: Array, dim: Array | int) -> Array:
-        """Return the share (M,) of its length that the answer leaves each, by its weight."""
-        return np.clip(1.0 - weights * self.spread / dim, 0.0, 1.0)
+    def evidence(self, tails: tuple[Kernel, ...], weights: Array, *, dim: int) -> Array:
+        """Return how likely (C,) each of some tails makes them, as a logarithm.
+
+        By its weight each counts for the share of its length that the answer leaves it.
+        """
+        telling = np.clip(1.0 - weights * self.spread / dim, 0.0, 1.0)
+        return tail_evidence(tails, self.square, telling, dim=dim)
 
 
 @final
@@ -314,8 +318,9 @@ class TailSchedule:
         tails, found = tails_of(self.wanted), []
         for _, rows, dim in self._sensors():
             own = Lengths(*(column[rows] for column in lengths))
-            evidence = tail_evidence(tails, own.square, own.telling(weights[rows], dim), dim=dim)
-            found.append(likeliest_tail(tails, evidence, dim=dim))
+            found.append(
+                likeliest_tail(tails, own.evidence(tails, weights[rows], dim=dim), dim=dim)
+            )
         return tuple(found)
 
     def after(

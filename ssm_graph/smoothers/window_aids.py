@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.similarity import WEIGHT_FLOOR, Kernel, Similarity
-from factors.tails import likeliest_tail, tail_evidence, tails_of
+from factors.tails import likeliest_tail, tails_of
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.times import Indices
 from ssm_graph.engine.reweighting import Lengths
@@ -73,9 +73,7 @@ class _Measured(NamedTuple):
 
     def evidence(self, tails: tuple[Kernel, ...]) -> Array:
         """Return how likely (C,) each of some tails makes them."""
-        dim = self.aid.dim
-        telling = Lengths(self.t, self.spread).telling(self.weight, dim)
-        return tail_evidence(tails, self.t, telling, dim=dim)
+        return Lengths(self.t, self.spread).evidence(tails, self.weight, dim=self.aid.dim)
 
     def replaced(self, rows: slice, by: _Measured) -> _Measured:
         """Return these with as many others in the place of successive ones."""
