@@ -86,11 +86,15 @@ class GraphLinearizer:
     def beam_rows(self, states: States) -> BeamRows:
         """Linearise all beams at ``states``."""
         prepared = self._beams.prepare(states.walks, states.constants, states.bias)
-        rows = self._beams.rows(self._at_beams(states), prepared)
         if self.freed is None:
-            return rows
-        rows.jacobian[:, self.problem.extras.columns(FAULTS)] = self.freed.beams
-        return rows._replace(error=rows.error + self.freed.beams @ self._off_by(states))
+            return self._beams.rows(self._at_beams(states), prepared)
+        off_by, instrument = self._off_by(states), prepared.instrument
+        held_b = self.freed.held(instrument.beam_b, off_by)
+        prepared = prepared._replace(instrument=instrument._replace(beam_b=held_b))
+        rows = self._beams.rows(self._at_beams(states), prepared)
+        own = self.freed.on_beams(self.problem, states, held_b, off_by)
+        rows.jacobian[:, self.problem.extras.columns(FAULTS)] = own
+        return rows._replace(error=rows.error + self.freed.beams @ off_by)
 
     def solve(
         self, states: States, beam_rows: BeamRows, weights: Array, aid_weights: Array | None = None
@@ -134,7 +138,7 @@ class GraphLinearizer:
         """Which of the beam speeds (M,) something was freed on."""
         if self.freed is None:
             return np.zeros(len(self.problem.beams.speed), np.bool_)
-        return np.asarray(self.freed.beams.any(axis=1))
+        return self.freed.has_beam
 
     def inertial_rows(self, states: States) -> Array:
         """Return the rows of inertial data and walks, see :class:`InertialRows`."""

@@ -7,11 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.evidence import Evidence
+from ssm_graph.engine.extras import Extras
+from ssm_graph.graph.beam_rows import BeamRows
 from ssm_graph.graph.first_values import first_values
+from ssm_graph.graph.freed import FAULTS, Freed, OfArray, array_columns
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.mission.estimate import Estimate, Status
 from ssm_graph.mission.fault import Treatment
@@ -40,7 +44,6 @@ from ssm_graph.smoothers.batch import SmootherConfig, SsmSmoother
 from ssm_graph.smoothers.faults.columns import (
     KERNEL,
     beside_median,
-    calibration_columns,
     noisier_than_others,
 )
 from ssm_graph.smoothers.faults.grid import Grid
@@ -291,17 +294,50 @@ def test_a_wrong_scale_is_no_fault_of_a_beam() -> None:
     assert {found.sensor for found in estimate.faults} <= {"DVL"}
 
 
-def test_calibration_columns_are_the_change_of_the_speeds() -> None:
+def test_columns_of_the_array_are_the_change_of_the_speeds() -> None:
     """Against the linearised beams: scale as the speed itself, angles as a turn of the body."""
     problem = build_problem(simulated(perfect_sensors=True, duration_s=20.0).mission)
     states = first_values(problem, kernel=KERNEL).states
-    columns = calibration_columns(problem, states)
+    columns = array_columns(problem, states, problem.beams.beam_b)
     rows = GraphLinearizer(problem).beam_rows(states)
-    lever = np.cross(problem.beams.gyro_b, problem.beams.lever_arm_b)
-    along_lever = np.einsum("mi,mi->m", problem.beams.beam_b, lever)
-    np.testing.assert_allclose(columns[:, 0], problem.beams.speed - along_lever, atol=1e-2)
-    # A turn of the mounting moves the beams as the opposite turn of the body moves the velocity.
-    np.testing.assert_allclose(columns[:, 1:], -rows.jacobian[:, :3], atol=1e-2)
+    speed = problem.beams.speed + rows.error
+    np.testing.assert_allclose(columns[:, 0], speed, atol=1e-3)
+    # With the body, or in it: the beams turn; what the lever arm adds turns with the body alone.
+    lever_b = np.cross(problem.beams.gyro_b, problem.beams.lever_arm_b)
+    of_body = rows.jacobian[:, :3] + np.cross(problem.beams.beam_b, lever_b)
+    np.testing.assert_allclose(columns[:, 1:], of_body, atol=1e-3)
+
+
+def test_a_turn_and_a_scale_of_the_array_are_taken_off_whole() -> None:
+    """The beams that a turned instrument has, 7 deg and 4 %; derivatives by differences."""
+    problem = build_problem(simulated(perfect_sensors=True, duration_s=20.0).mission)
+    beams = problem.beams
+    inside = beams.keyframe >= 8
+    array = (
+        OfArray(inside, slice(0, 3), np.eye(4)[:, 1:]),
+        OfArray(inside, slice(3, 4), np.eye(4)[:, :1]),
+    )
+    none = Freed.nothing(problem).with_between(
+        np.ones(4), np.zeros((problem.n_keyframes - 1, 15, 4))
+    )
+    freed = replace(none, array=array)
+    problem = replace(problem, extras=Extras((*problem.extras.blocks, freed.variable)))
+    states = first_values(problem, kernel=KERNEL).states
+    off_by = np.array([0.05, -0.02, 0.12, 0.04])
+
+    def rows_at(off_by: Array) -> BeamRows:
+        return GraphLinearizer(problem, freed).beam_rows(states._replace(constants=off_by))
+
+    turned_b = 1.04 * beams.beam_b @ Rotation.from_rotvec(off_by[:3]).as_matrix().T
+    moved = replace(problem, beams=replace(beams, beam_b=turned_b))
+    as_held = GraphLinearizer(moved, none).beam_rows(states._replace(constants=np.zeros(4)))
+    as_stated = rows_at(np.zeros(4))
+    expected = np.where(inside, as_held.error, as_stated.error)
+    np.testing.assert_allclose(rows_at(off_by).error, expected, rtol=0.0, atol=1e-12)
+    columns = rows_at(off_by).jacobian[:, problem.extras.columns(FAULTS)]
+    for i, step in enumerate(1e-6 * np.eye(4)):
+        difference = (rows_at(off_by + step).error - rows_at(off_by - step).error) / 2e-6
+        np.testing.assert_allclose(columns[:, i], difference, atol=1e-3)
 
 
 class OneChannel:

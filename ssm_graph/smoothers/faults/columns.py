@@ -22,7 +22,8 @@ from ssm_graph.engine.error_state import ACCEL_BIAS, STATE_DIM
 from ssm_graph.engine.evidence import BetweenRows, Columns, OwnRows
 from ssm_graph.engine.states import States
 from ssm_graph.graph.aids.aid import Aid
-from ssm_graph.graph.beam_rows import BeamRows, WaterRows
+from ssm_graph.graph.beam_rows import BeamRows
+from ssm_graph.graph.freed import array_columns
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.graph.measurements import states_at
 from ssm_graph.mission.problem import Problem
@@ -322,9 +323,9 @@ class Channels:
         R_nb = states.R_nb[beams.keyframe]
         along_n = np.einsum("mij,mj->mi", R_nb, beams.beam_b)
         made[:, self.of(BOTTOM).columns] = -along_n * ~beams.is_water[:, None]
-        calibration = calibration_columns(problem, states)
-        made[:, self.of(SCALE).columns] = calibration[:, :1]
-        made[:, self.of(MOUNTING).columns] = calibration[:, 1:]
+        of_array = array_columns(problem, states, beams.beam_b)
+        made[:, self.of(SCALE).columns] = of_array[:, :1]
+        made[:, self.of(MOUNTING).columns] = of_array[:, 1:]
         # What gyros are off by turns the instrument about the vehicle's origin as well.
         made[:, self.of(IMU).columns][:, 3:] = -np.cross(beams.lever_arm_b, beams.beam_b)
         return made
@@ -365,15 +366,3 @@ class Channels:
         between = np.zeros((*linear.between.missed.shape, self.width))
         between[:, :STATE_DIM, self.of(IMU).columns] = self.between
         return Columns(np.concatenate(rows)[linear.order], between)
-
-
-def calibration_columns(problem: Problem, states: States) -> Array:
-    """Return what scale (1) and mounting angles (3, rad) do to the beam speeds (M, 4), m/s."""
-    beams, k = problem.beams, problem.beams.keyframe
-    R_nb, v_n = states.R_nb[k], states.v_n[k]
-    water = WaterRows(beams, problem.extras, problem.frame)
-    through = water.relative(v_n, p_n=states.p_n[k], walks=states.walks[k], rows=np.s_[:])
-    v_n = v_n if through is None else through.v_n
-    v_b = np.einsum("mij,mi->mj", R_nb, v_n)
-    along = np.einsum("mi,mi->m", beams.beam_b, v_b)
-    return np.column_stack([along, np.cross(v_b, beams.beam_b)])

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factors.similarity import WEIGHT_FLOOR
 from ssm_graph.base.frozen import Array
@@ -25,22 +24,20 @@ from ssm_graph.mission.fault import DetectedFault, Treatment
 from ssm_graph.mission.problem import Problem
 from ssm_graph.smoothers.faults.columns import (
     BEAM,
-    BOTTOM,
     CLOCK,
     IMU,
-    MOUNTING,
-    SCALE,
     TREND_S,
     Channels,
     columns_of_biases,
     linear_of_steps,
 )
+from ssm_graph.smoothers.faults.freeing import columns_of, freed_of, inside_of
 from ssm_graph.smoothers.faults.hypotheses import Course
 from ssm_graph.smoothers.faults.judged import Fault, Judge
 from ssm_graph.smoothers.faults.nuisances import Nuisances
 from ssm_graph.smoothers.faults.pieces import PieceSearch
 from ssm_graph.smoothers.faults.search import Beside, FaultSearch, with_rivals
-from ssm_graph.smoothers.faults.unstated import WIDER, Unstated
+from ssm_graph.smoothers.faults.unstated import Unstated
 from ssm_graph.smoothers.faults.windows import noisier_than_stated
 from ssm_graph.smoothers.unwound import unwound_steps
 
@@ -162,7 +159,8 @@ class FaultWatch:
         decided = sorted(found[:n_decided], key=lambda fault: (fault.begin, fault.end))
         self._found = [*decided, *self._undecided]
         self._leave_out(channels)
-        freed, problem = self._freed(channels), self._problem
+        problem = self._problem
+        freed = freed_of(self._found, channels, problem, self._unstated)
         if len(freed.sigma):
             blocks = (*problem.extras.blocks, freed.variable)
             problem = replace(problem, extras=Extras(blocks))
@@ -203,7 +201,7 @@ class FaultWatch:
         freed, extras = linearizer.freed or Freed.nothing(self._problem), linearizer.problem.extras
         between = columns_of_biases(linearizer.inertial_rows(states), extras.state_dim)
         at = np.arange(len(between)), self._problem.keyframe_s
-        wide = freed.with_between(sigma, _columns(self._possible, {IMU: between}, *at))
+        wide = freed.with_between(sigma, columns_of(self._possible, {IMU: between}, *at))
         extras = extras.without({FAULTS})
         problem = replace(linearizer.problem, extras=Extras((*extras.blocks, wide.variable)))
         constants = np.concatenate([states.constants, np.zeros(len(sigma))])
@@ -244,34 +242,6 @@ class FaultWatch:
             found.append(replace(first, rivals=tuple(rivals)))
         return found
 
-    def _freed(self, channels: Channels) -> Freed:
-        """Return the columns of all that was found."""
-        faults = [one for one in with_rivals(self._found) if one.n_constants]
-        beams, time_s = self._problem.beams, self._problem.keyframe_s
-        on_array = {
-            name: channels.beams[:, channels.of(name).columns]
-            for name in (BEAM, BOTTOM, SCALE, MOUNTING, IMU)
-        }
-        on_imu = {IMU: channels.between}
-        keyframes = np.arange(len(channels.between))
-        sigmas = [np.resize(one.hypothesis.sigma, one.n_constants) for one in faults]
-        between = [_columns(faults, on_imu, keyframes, time_s)]
-        n_more, imu = 0, self._unstated
-        if imu is not None:
-            n_more = len(imu.errors_sigma)
-            sigmas.append(WIDER * imu.errors_sigma)
-            between.append(imu.errors_columns)
-        return Freed(
-            sigma=np.concatenate([np.zeros(0), *sigmas]),
-            beams=_behind(_columns(faults, on_array, beams.keyframe, time_s), n_more),
-            between=np.concatenate(between, axis=-1),
-            aids={
-                name: _behind(_columns(faults, on_aid, channels.aid_keyframe[name], time_s), n_more)
-                for name, on_aid in channels.of_aids()
-                if any(one.hypothesis.channel in on_aid for one in faults)
-            },
-        )
-
     def _leave_out(self, channels: Channels) -> None:
         """Note which measurements may have read anything."""
         beams = self._problem.beams
@@ -283,9 +253,9 @@ class FaultWatch:
                 continue
             if name == BEAM:
                 own = np.flatnonzero(fault.hypothesis.combined.any(axis=1))
-                self._beams_out |= np.isin(beams.beam, own) & _inside(beams.keyframe, fault)
+                self._beams_out |= np.isin(beams.beam, own) & inside_of(beams.keyframe, fault)
             else:
-                aids_out[name] |= _inside(channels.aid_keyframe[name], fault)
+                aids_out[name] |= inside_of(channels.aid_keyframe[name], fault)
         self.aids_out = np.concatenate([np.zeros(0, bool), *aids_out.values()])
 
     def faults(self, states: States, inertial: InertialFit) -> tuple[DetectedFault, ...]:
@@ -402,47 +372,3 @@ def beside(some: Sequence[Fault], others: Sequence[Fault], keyframe_s: Array) ->
     return [
         one for one in some if not any(same_faults([one], [other], keyframe_s) for other in others)
     ]
-
-
-def _behind(columns: Array, n_more: int) -> Array:
-    """Return columns (N, ..., F) with as many more behind them that do nothing."""
-    return np.concatenate([columns, np.zeros((*columns.shape[:-1], n_more))], axis=-1)
-
-
-def _inside(keyframe: NDArray[np.intp], fault: Fault) -> NDArray[np.bool_]:
-    return (keyframe >= fault.begin) & (keyframe < fault.end)
-
-
-def _columns(
-    faults: Sequence[Fault],
-    of_channels: Mapping[str, Array],
-    keyframe: NDArray[np.intp],
-    keyframe_s: Array,
-) -> Array:
-    """Return the columns (N, ..., F) of faults on rows at keyframes (N,).
-
-    ``of_channels`` are those (N, ..., c) of the channels that act on these rows.
-    """
-    rows = next(iter(of_channels.values())).shape[:-1]
-    parts = [np.zeros((*rows, 0))]
-    for fault in faults:
-        hypothesis = fault.hypothesis
-        if hypothesis.channel in of_channels:
-            columns = of_channels[hypothesis.channel] @ hypothesis.combined
-            parts.append(_over(columns, keyframe, fault, keyframe_s))
-        else:
-            parts.append(np.zeros((*rows, fault.n_constants)))
-    return np.concatenate(parts, axis=-1)
-
-
-def _over(columns: Array, keyframe: NDArray[np.intp], fault: Fault, keyframe_s: Array) -> Array:
-    """Return columns (N, ..., d) of rows at keyframes (N,) over the stretch of a fault."""
-    inside = _inside(keyframe, fault).reshape(-1, *[1] * (columns.ndim - 1))
-    constant = columns * inside
-    if not fault.hypothesis.has_rate:
-        return np.asarray(constant)
-    since = (keyframe_s[keyframe] - keyframe_s[fault.begin]) / TREND_S
-    rate = constant * since.reshape(inside.shape)
-    if fault.hypothesis.course is Course.RAMP:
-        return np.asarray(rate)
-    return np.concatenate([constant, rate], axis=-1)
