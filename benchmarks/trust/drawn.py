@@ -8,11 +8,27 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.trust.lies import INERTIAL, Rng
-from ssm_graph.simulation import Fault, FaultShape, Sensor
+from ssm_graph.simulation import (
+    AidSettings,
+    BeaconSettings,
+    CompassSettings,
+    Fault,
+    FaultShape,
+    RangingSettings,
+    Sensor,
+    UsblSettings,
+)
 
 TWO = 0.3
 """Share of the missions that have two faults, of different sensors."""
-NAMED = {Sensor.DVL: ("DVL",), Sensor.GNSS: ("GNSS",), Sensor.DEPTH: ("depth",)}
+NAMED = {
+    Sensor.DVL: ("DVL",),
+    Sensor.GNSS: ("GNSS",),
+    Sensor.DEPTH: ("depth",),
+    Sensor.USBL: ("USBL",),
+    Sensor.COMPASS: ("heading", "compass"),
+    Sensor.RANGES: ("range", "beacon"),
+}
 """Words of which a verdict has to use one; of other sensors :data:`INERTIAL_NAMES`."""
 _VECTOR = 3
 _PLANE = 2
@@ -86,7 +102,23 @@ KINDS = (
     Kind(S.IMU, F.NOISE, 3.0, 10.0),
     Kind(S.IMU, F.LATE, 0.05, 0.5),
     Kind(S.IMU, F.CLOCK, 0.05, 1.0),
+    Kind(S.USBL, F.CONSTANT, 3.0, 30.0, dim=_VECTOR),
+    Kind(S.USBL, F.RAMP, 0.02, 0.3, dim=_PLANE),
+    Kind(S.USBL, F.STUCK),
+    Kind(S.USBL, F.LATE, 1.0, 10.0),
+    Kind(S.USBL, F.NOISE, 2.0, 8.0),
+    Kind(S.COMPASS, F.CONSTANT, 2.0 * DEG, 20.0 * DEG),
+    Kind(S.COMPASS, F.RAMP, 0.01 * DEG, 0.2 * DEG),
+    Kind(S.COMPASS, F.STUCK),
+    Kind(S.COMPASS, F.LATE, 0.3, 3.0),
+    Kind(S.COMPASS, F.NOISE, 2.0, 8.0),
+    Kind(S.RANGES, F.CONSTANT, 0.5, 10.0),
+    Kind(S.RANGES, F.RAMP, 0.005, 0.1),
+    Kind(S.RANGES, F.SCALE, 0.005, 0.1),
+    Kind(S.RANGES, F.SPIKES, 2.0, 20.0),
 )
+BEACONS = ((90.0, 20.0, -30.0), (-40.0, 110.0, -30.0), (-60.0, -80.0, -30.0))
+"""East, north and up of the start, m; three beacons."""
 SHORTEST_S = 20.0
 """Of those that may last to the end; others are at least a quarter of what they are at most."""
 
@@ -149,3 +181,14 @@ def _window(kind: Kind, rng: Rng, end_s: float) -> tuple[float, float]:
     length_s = math.exp(rng.uniform(math.log(shortest_s), math.log(longest_s)))
     start_s = float(rng.uniform(0.05 * end_s, 0.95 * end_s - length_s))
     return start_s, start_s + length_s
+
+
+def aids_of(found: list[Drawn]) -> AidSettings:
+    """Return the aids that a mission needs for such faults, and no others."""
+    sensors = {one.kind.sensor for one in found}
+    beacons = tuple(BeaconSettings(number, place) for number, place in enumerate(BEACONS, 1))
+    return AidSettings(
+        usbl=UsblSettings() if S.USBL in sensors else None,
+        compass=CompassSettings() if S.COMPASS in sensors else None,
+        ranging=RangingSettings(beacons) if S.RANGES in sensors else None,
+    )

@@ -17,7 +17,7 @@ import numpy as np
 
 from benchmarks.processes import all_done, tell
 from benchmarks.report import Option, Report, number_text, table
-from benchmarks.trust.drawn import drawn
+from benchmarks.trust.drawn import aids_of, drawn
 from benchmarks.trust.lies import LIES
 from ssm_graph import Estimate, SsmGraphError, evaluate, smooth
 from ssm_graph.base.code_version import code_version
@@ -125,6 +125,7 @@ class Case(NamedTuple):
     """Of each the words of which the verdict has to use one"""
     with_gnss: bool
     kind: str = ""
+    aids: AidSettings = AidSettings()
 
 
 def case_of(label: str, seed: int) -> Case:
@@ -138,6 +139,7 @@ def case_of(label: str, seed: int) -> Case:
             tuple(one.named for one in found),
             has_fixes,
             ", ".join(one.kind.label for one in found),
+            aids_of(found),
         )
     lie = LIES[label]
     has_fixes = seed % 2 == 0 if lie.with_gnss is None else lie.with_gnss
@@ -150,7 +152,7 @@ def run(key: Key) -> Row:
     """Smooth one mission (label, grade, seed, is realistic) with its lie, and as the oracle."""
     label, grade, seed, realistic = str(key[0]), str(key[1]), int(key[2]), bool(key[3])
     case = case_of(label, seed)
-    sim = mission_of(grade, seed, with_gnss=case.with_gnss, realistic=realistic)
+    sim = mission_of(grade, seed, with_gnss=case.with_gnss, realistic=realistic, aids=case.aids)
     broken = with_faults(sim.mission, case.faults, truth=sim.truth_at, seed=seed)
     begin = time.process_time()
     try:
