@@ -45,6 +45,7 @@ from ssm_graph.smoothers.faults.columns import (
     KERNEL,
     beside_median,
     noisier_than_others,
+    spike_weights,
 )
 from ssm_graph.smoothers.faults.grid import Grid
 from ssm_graph.smoothers.faults.hypotheses import Course, Hypothesis
@@ -338,6 +339,22 @@ def test_a_turn_and_a_scale_of_the_array_are_taken_off_whole() -> None:
     for i, step in enumerate(1e-6 * np.eye(4)):
         difference = (rows_at(off_by + step).error - rows_at(off_by - step).error) / 2e-6
         np.testing.assert_allclose(columns[:, i], difference, atol=1e-3)
+
+
+def test_readings_weigh_less_while_they_scatter_more() -> None:
+    """Five times the noise for 150 of 600 readings, with spikes and an offset that stays."""
+    rng = np.random.default_rng(3)
+    whitened = rng.normal(size=(600, 2))
+    whitened[200:350] *= 5.0
+    whitened[::37] += 20.0
+    whitened[400:] += 3.0
+    weights = spike_weights(whitened)
+    sound = np.arange(600) % 37 != 0
+    inside = sound & (np.arange(600) >= 215) & (np.arange(600) < 335)
+    outside = sound & ((np.arange(600) < 170) | (np.arange(600) >= 380))
+    assert 0.5 / 25.0 < np.median(weights[inside]) < 2.0 / 25.0
+    assert np.median(weights[outside]) > 0.6
+    assert weights[~sound].max() < 0.1
 
 
 class OneChannel:

@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 from factors.similarity import WEIGHT_FLOOR, LogKernel
 from ssm_graph.base.frozen import Array
@@ -50,6 +51,10 @@ NOISIER = 1.6
 """Variance by that of the others, from which on a beam is noisier than these,"""
 NOISIER_DEVIATIONS = 5.0
 """if by as many of its deviations: of four readings of 1 / n in the square, for a tail."""
+NOISE_OVER = 61
+"""Successive readings whose scatter is compared with that elsewhere, and"""
+OTHER_NOISE = 1.3
+"""by how much their sigma has to be another one: four deviations of that of so many."""
 BESIDE_MEDIAN = 0.925
 """Variance of a Gaussian reading less the median of seven, of which it is one."""
 
@@ -90,14 +95,19 @@ def spike_weights(whitened: Array) -> Array:
     """Return weights (N,) of successive readings (N, d) by how far they stick out.
 
     What sticks out is measured by what is usual here: sigmas stated too small would make faults of
-    noise. So weights are below one throughout where readings scatter more than stated.
+    noise. So weights are below one throughout where readings scatter more than stated, and over
+    stretches by how much these scatter, if that is not as elsewhere.
     """
     square, dim = _squares_beside_median(whitened), whitened.shape[1]
-    excess = 1.0
+    excess = np.ones(len(square))
     for _ in range(4):
         weights = KERNEL.weight(square / excess, dim=dim)
-        mean = float(np.sum(weights * square) / max(np.sum(weights) * dim, 1.0))
-        excess = max(mean, 1.0)
+        counted = np.stack([weights * square, weights * dim])
+        within = uniform_filter1d(counted, NOISE_OVER, axis=1)
+        here = np.maximum(within[0] / np.maximum(within[1], 1.0 / NOISE_OVER), 1.0)
+        usual = np.median(here)
+        is_usual = np.abs(np.log(here / usual)) < 2.0 * np.log(OTHER_NOISE)
+        excess = np.where(is_usual, usual, here)
     return np.asarray(weights / excess)
 
 
@@ -109,7 +119,7 @@ def _squares_beside_median(whitened: Array) -> Array:
 def noisier_than_others(whitened: Array, beam: NDArray[np.intp], n_beams: int) -> Array:
     """Return the sigma of each beam by that of the others, 1.0 where it is no more than chance.
 
-    A beam that is never heard is no noisier than others.
+    It is that of most of the time. A beam that is never heard is no noisier than others.
 
     Parameters
     ----------
@@ -119,7 +129,8 @@ def noisier_than_others(whitened: Array, beam: NDArray[np.intp], n_beams: int) -
     """
     each = [_squares_beside_median(whitened[beam == b][:, None]) for b in range(n_beams)]
     each = [x[x < REACH_SQ] for x in each]  # gross errors are weighed away one by one
-    variance = np.array([np.mean(x) if len(x) else 0.0 for x in each])
+    within = [uniform_filter1d(x, NOISE_OVER) for x in each]
+    variance = np.array([np.median(x) if len(x) else 0.0 for x in within])
     count = np.array([len(x) for x in each])
     factor = np.ones(n_beams)
     heard = np.flatnonzero(count)

@@ -44,8 +44,8 @@ ALLOWED_M = 0.1
 SEEN_M = 2.0 * ALLOWED_M
 """And that by which it is looked for: larger ones are no longer usual."""
 NOISY = 24.0
-"""Chi-square that a beam noisier than the others needs less: whatever makes it so, weak echoes or
-a foul transducer, seldom has a mean of zero. Over the whole mission it is freed in any case."""
+"""Chi-square that a beam noisier than the others needs less over the whole mission: whatever makes
+it so, weak echoes or a foul transducer, seldom has a mean of zero. It is freed in any case."""
 LATEST_S = 10.0
 """Prior sigma of a delay."""
 RISING_M_PER_S = 0.05
@@ -83,7 +83,8 @@ class Hypothesis:
     handicap: float = 0.0
     """Chi-square by which it has to be better than others."""
     odds: float = 0.0
-    """By which it needs less, for the sensor shows besides that it is not sound"""
+    """By which it needs less, for the sensor shows besides that it is not sound, at all times:
+    such a one lasts over the whole mission"""
     tail: float = 2e-7
     """Probability of one stretch's chi-square where nothing is off"""
 
@@ -141,7 +142,9 @@ def _of_beams(channels: Channels) -> Iterator[Hypothesis]:
     for beam in range(n_beams):
         one = Hypothesis(f"DVL beam {beam + 1}", BEAM, unit[:, [beam]], np.full(1, 3.0), _speeds)
         noise = float(channels.beam_noise[beam])
-        yield one if noise == 1.0 else replace(one, say=partial(_noisy, noise), odds=NOISY)
+        yield one
+        if noise > 1.0:
+            yield replace(one, say=partial(_noisy, noise), odds=NOISY)
         yield replace(one, course=Course.TREND)
         yield replace(one, course=Course.ANYTHING)
     for a, b in itertools.combinations(range(n_beams), 2):

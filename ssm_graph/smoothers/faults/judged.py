@@ -273,6 +273,8 @@ class Judged:
         discount = np.zeros((len(edges), len(edges)))
         discount[0] += AT_AN_END
         discount[:, -1] += AT_AN_END
+        is_whole = np.zeros((len(edges), len(edges)), bool)
+        is_whole[0, -1] = True
         best_so_far: dict[str, float] = {}
         for hypothesis in hypotheses:
             # Where no constant is worth a look in any stretch, there is nothing of another course.
@@ -285,6 +287,8 @@ class Judged:
             largest = float(np.max(chi_sq))
             best_so_far[hypothesis.sensor] = max(best_so_far.get(hypothesis.sensor, 0.0), largest)
             merit = np.where(is_apart, -np.inf, chi_sq - charge + discount)
+            if hypothesis.odds:
+                merit[~is_whole] = -np.inf
             begin, end = np.unravel_index(int(np.argmax(merit)), merit.shape)
             own = (float(table[begin, end]) for table in (chi_sq, merit, discount))
             found.append(Candidate(hypothesis, int(begin), int(end), *own))
