@@ -231,6 +231,20 @@ def test_a_beam_noisier_than_the_others_is_named() -> None:
     assert errors(estimate, sim)[1] < 5.0
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("sensor", [Sensor.DVL, Sensor.GNSS, Sensor.DEPTH])
+def test_noise_that_rises_for_a_while_is_no_row_of_faults(sensor: Sensor) -> None:
+    """Five times as stated for two minutes: nothing is taken off, and nothing lost."""
+    sim = simulated(duration_s=300.0, dvl=QUIET, gnss=FIXES, seed=5)
+    beams = (1,) if sensor is Sensor.DVL else ()
+    fault = Fault(beams, 80.0, 200.0, shape=FaultShape.NOISE, sensor=sensor, size=5.0)
+    broken = with_faults(sim.mission, (fault,), truth=sim.truth_at, seed=1)
+    estimate = smoothed(replace(sim, mission=broken.mission))
+    taken_off = {Treatment.FREED, Treatment.LEFT_OUT, Treatment.COVERED}
+    assert not [found for found in estimate.faults if found.treatment in taken_off]
+    assert errors(estimate, sim)[1] < 5.0
+
+
 def test_the_search_goes_with_calibration() -> None:
     """Extra variables take part with their priors while stretches are judged."""
     sim = simulated(duration_s=140.0, faults=(Fault((2,), 40.0, 100.0, 0.03),))

@@ -119,7 +119,7 @@ def _squares_beside_median(whitened: Array) -> Array:
 def noisier_than_others(whitened: Array, beam: NDArray[np.intp], n_beams: int) -> Array:
     """Return the sigma of each beam by that of the others, 1.0 where it is no more than chance.
 
-    It is that of most of the time. A beam that is never heard is no noisier than others.
+    It is that of three quarters of the time. A beam that is never heard is no noisier than others.
 
     Parameters
     ----------
@@ -129,8 +129,8 @@ def noisier_than_others(whitened: Array, beam: NDArray[np.intp], n_beams: int) -
     """
     each = [_squares_beside_median(whitened[beam == b][:, None]) for b in range(n_beams)]
     each = [x[x < REACH_SQ] for x in each]  # gross errors are weighed away one by one
-    within = [uniform_filter1d(x, NOISE_OVER) for x in each]
-    variance = np.array([np.median(x) if len(x) else 0.0 for x in within])
+    within = [uniform_filter1d(x, NOISE_OVER // 3) for x in each]
+    variance = np.array([np.quantile(x, 0.25) if len(x) else 0.0 for x in within])
     count = np.array([len(x) for x in each])
     factor = np.ones(n_beams)
     heard = np.flatnonzero(count)
