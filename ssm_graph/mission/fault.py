@@ -48,7 +48,7 @@ class DetectedFault(ShortRepr):
     """with so many numbers."""
     treatment: Treatment
     rivals: tuple[str, ...] = ()
-    """Other sensors, with what they would have done, that explain the data as well."""
+    """Other sensors, or the same, with what they would have done, that explain the data as well."""
     cost_m: float = 0.0
     """By how much the horizontal position moves, at most, between the explanations, m."""
     remedy: str = ""
@@ -68,8 +68,9 @@ class DetectedFault(ShortRepr):
 
     @property
     def is_decided(self) -> bool:
-        """Whether the data name this sensor and no other."""
-        return not self.rivals
+        """Whether the data name this sensor then, and no other: how it was off may be open."""
+        this = f"{self._when}, "
+        return all(rival.startswith(this) for rival in self.rivals)
 
     @property
     def is_suspect(self) -> bool:
@@ -79,9 +80,12 @@ class DetectedFault(ShortRepr):
     @property
     def sentence(self) -> str:
         """The finding for people: who, when, what, and what became of it."""
-        text = f"{self.sensor}, {self.begin_s:.0f}-{self.end_s:.0f} s, {self.what}: "
-        text += self.treatment.value
+        text = f"{self._when}, {self.what}: {self.treatment.value}"
         if self.rivals:
             text += f"; {' or '.join(self.rivals)} would explain the data as well"
             text += f" (the answers differ by {self.cost_m:.2g} m at most)" if self.cost_m else ""
         return f"{text}; {self.remedy}" if self.remedy else text
+
+    @property
+    def _when(self) -> str:
+        return f"{self.sensor}, {self.begin_s:.0f}-{self.end_s:.0f} s"

@@ -230,23 +230,26 @@ class SsmSmoother:
         problem, aids, known = linearizer.problem, linearizer.weighted, np.ones(len(used.aids))
         t, weights, keyframe_s = last.mahalanobis_sq, last.weights, problem.keyframe_s
         beams_s = keyframe_s[problem.beams.keyframe]
+        freed, beam = linearizer.has_freed_beam, problem.beams.beam
         says, noisy = informative(
-            DVL, t, weights, beams_s, used.of_beams.kernel, freed=linearizer.has_freed_beam
+            DVL, t, weights, beams_s, used.of_beams.kernel, freed=freed, beam=beam
         )
-        found = [noisy and noisy_or_compared(noisy, problem.beams, beams_s)]
+        found = [*noisy]
+        if len(noisy) > 1 or any(one.sensor == DVL for one in noisy):  # no motion is in one beam
+            found = [noisy_or_compared(one, problem.beams, beams_s) for one in noisy]
         beams = says / faults.inflation_of(DVL)
         for aid, kernel in zip(aids.all, used.of_aids.kernels, strict=True):
             own = aids.of(aid, last.aid_lengths.square), aids.of(aid, last.aid_weights)
-            says, noise = informative(aid.name, *own, keyframe_s[aid.keyframe], kernel, dim=aid.dim)
+            says, noisy = informative(aid.name, *own, keyframe_s[aid.keyframe], kernel, dim=aid.dim)
             aids.of(aid, known)[:] = says / faults.inflation_of(aid.name)
-            found.append(noise)
+            found.extend(noisy)
         step = yield from linearizer.solve_steps(
             last.states, last.beam_rows, beams * last.weights, known * last.aid_weights
         )
         readings = readings_of(
             linearizer, last.states, last.beam_rows.error, last.weights, last.aid_weights
         )
-        left = [one for one in found if one is not None] + disagreeing(readings, keyframe_s)
+        left = [*found, *disagreeing(readings, keyframe_s)]
         return linearizer, last._replace(step=faults.covering(step)), left
 
     def _iterate(

@@ -136,7 +136,8 @@ def test_lies_that_last_are_named_and_cost_little(name: str) -> None:
     assert estimate.status is Status.CONVERGED, estimate.reason
     found = max(estimate.faults, key=lambda one: one.chi_sq)
     assert found.sensor == sensor
-    assert found.treatment is Treatment.FREED
+    assert found.treatment in {Treatment.FREED, Treatment.COVERED}
+    assert found.is_decided  # on a straight way a turned array is one with an offset
     assert abs(found.begin_s - fault.start_s) < 12.0
     assert abs(found.end_s - min(fault.end_s, 200.0)) < 12.0
     assert found.sentence in estimate.notes

@@ -83,9 +83,25 @@ def test_noise_that_a_lie_leaves_is_not_said(*, is_freed: bool) -> None:
     t = np.where(is_off, 8.0 * np.sin(time_s), rng.standard_normal(1600)) ** 2
     weights, freed = kernel.weight(t), is_off & is_freed
     says, found = informative("DVL", t, weights, time_s, kernel, freed=freed)
-    assert (found is None) == is_freed
+    assert (not found) == is_freed
     assert (np.mean((says * weights)[is_off]) < 0.05) == is_freed
     assert np.min(says[time_s < 200.0]) >= LEAST_EFFICIENCY
+
+
+@pytest.mark.parametrize(("noisy", "who"), [({1}, "DVL beam 2"), ({0, 1, 2, 3}, "DVL")])
+def test_each_beam_has_a_noise_of_its_own(noisy: set[int], who: str) -> None:
+    """Three times as stated for half the time: its readings say about a ninth, others as before."""
+    rng, kernel = np.random.default_rng(2), LogKernel()
+    time_s, beam = np.repeat(np.arange(400.0), 4), np.tile(np.arange(4), 400)
+    is_off = np.isin(beam, list(noisy)) & (time_s >= 200.0)
+    t = (np.where(is_off, 3.0, 1.0) * rng.standard_normal(1600)) ** 2
+    weights = kernel.weight(t)
+    says, (found,) = informative("DVL", t, weights, time_s, kernel, beam=beam)
+    assert (found.sensor, found.end_s) == (who, 399.0)
+    assert 200.0 <= found.begin_s < 270.0
+    late = is_off & (time_s >= found.begin_s)
+    assert np.mean((says * weights)[late]) < 0.2  # by weights alone 0.5
+    assert np.min(says[~is_off]) >= LEAST_EFFICIENCY
 
 
 @pytest.mark.parametrize(("noise", "sensor"), [(1.0, "IMU"), (3.0, "DVL")])

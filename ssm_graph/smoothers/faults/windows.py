@@ -56,6 +56,10 @@ FEWEST: Final = 30
 """the fewest that do, and that a stretch has which is said to last,"""
 NOTABLE_SQUARE: Final = 2.0
 """and their variance by that stated, from which on they are noisier if that is no chance."""
+GROSS_SQ: Final = 25.0
+"""Square of the sigmas beyond which readings are gross errors if there are"""
+GROSS_MORE: Final = 2.0
+"""as many times more of them as noise makes that has the same median."""
 SEEN_BY_THREE: Final = 3
 """Beams: any speeds of so many are those of some velocity."""
 LEAST_SHARE: Final = 1e-3
@@ -223,11 +227,12 @@ def informative(
     *,
     dim: int = 1,
     freed: NDArray[np.bool_] | None = None,
-) -> tuple[Array, DetectedFault | None]:
-    """Return how much each measurement says (M,), by its weight, and whether a sensor is noisy.
+    beam: NDArray[np.intp] | None = None,
+) -> tuple[Array, list[DetectedFault]]:
+    """Return how much each measurement says (M,), by its weight, and who is noisy.
 
     What a lie leaves says nothing of the noise, and is judged apart: it counts for less, but larger
-    sigmas would not mend it.
+    sigmas would not mend it. Where the array as a whole is not noisy, one of its beams may be.
 
     Parameters
     ----------
@@ -236,17 +241,25 @@ def informative(
     kernel : that of the weights.
     dim : of the measurements.
     freed : (M,) those that a lie was taken off; if off all of them, all count alike.
+    beam : (M,) from 0, of a sensor that has any.
     """
     freed = np.zeros(len(t), np.bool_) if freed is None else freed & ~freed.all()
     most = np.full(len(t), np.inf)
     for own in (freed, ~freed):
         most[own] = most_by_noise(t[own], weights[own], time_s[own], dim=dim)
+    found = [_noisy(sensor, t, np.where(freed, np.inf, most), time_s, dim=dim)]
+    for one in () if beam is None or found[0] else np.unique(beam[~freed]).tolist():
+        own = (beam == one) & ~freed
+        counts = np.where(is_gross(t[own]), WEIGHT_FLOOR, weights[own])
+        most[own] = np.minimum(most[own], most_by_noise(t[own], counts, time_s[own]))
+        of_beam = np.where(own, most, np.inf)
+        found.append(_noisy(f"{sensor} beam {one + 1}", t, of_beam, time_s, dim=dim))
     says = np.minimum(efficiency(t, weights, kernel, dim=dim), most)
-    return says, _noisy(sensor, t, np.where(freed, np.inf, most), time_s, dim=dim)
+    return says, [one for one in found if one is not None]
 
 
 def noisy_or_compared(noisy: DetectedFault, beams: Beams, time_s: Array) -> DetectedFault:
-    """Return the finding of a noisy DVL, or of what it is compared with, if its beams agree.
+    """Return the finding of a noisy DVL, or beam, or of what it is compared with, if beams agree.
 
     What no velocity makes of more than three beams is their noise alone, whatever the vehicle does.
     Only the beams of the finding's stretch are asked, by their times (M,), s.
@@ -320,3 +333,11 @@ def most_by_noise(t: Array, weights: Array, time_s: Array, *, dim: int = 1) -> A
         if scale_sq > NOTABLE_SQUARE and chance < TAIL:
             most[own] = max(1.0 / (scale_sq * float(np.mean(weights[own]))), LEAST_SHARE)
     return most
+
+
+def is_gross(t: Array) -> NDArray[np.bool_]:
+    """Return which squared lengths (N,) are gross errors: more than noise makes of its median."""
+    gross = t > GROSS_SQ
+    scale_sq = float(np.median(t)) / float(chi2.isf(0.5, 1))
+    by_noise = float(chi2.sf(GROSS_SQ / scale_sq, 1))
+    return gross & (np.mean(gross) > GROSS_MORE * by_noise)
