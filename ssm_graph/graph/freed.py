@@ -84,24 +84,29 @@ class Freed:
             self.array,
         )
 
-    def held(self, beam_b: Array, off_by: Array) -> Array:
-        """Return the directions (M, 3) of beams, as long as they read, for numbers (F,)."""
+    def held(self, beam_b: Array, off_by: Array, *, unscaled: OfArray | None = None) -> Array:
+        """Return the directions (M, 3) of beams, as long as they read, for numbers (F,).
+
+        ``unscaled`` is a stretch whose scale is left out: that of a DVL that reads zero is -1.
+        """
         held_b = beam_b
         for one in self.array:
             scale, *turn_b = one.combined @ off_by[one.columns]
-            turned = (1.0 + scale) * held_b @ so3.exp(np.array(turn_b)).T
+            factor = 1.0 if one is unscaled else 1.0 + scale
+            turned = factor * held_b @ so3.exp(np.array(turn_b)).T
             held_b = np.where(one.inside[:, None], turned, held_b)
         return held_b
 
-    def on_beams(self, problem: Problem, states: States, held_b: Array, off_by: Array) -> Array:
-        """Return the columns (M, F) on the beam speeds at states, for beams so :meth:`held`."""
+    def on_beams(self, problem: Problem, states: States, beam_b: Array, off_by: Array) -> Array:
+        """Return the columns (M, F) on the beam speeds at states, for beams (M, 3) as stated."""
         if not self.array:
             return self.beams
-        by, columns = array_columns(problem, states, held_b), self.beams.copy()
+        columns = self.beams.copy()
         for one in self.array:
             scale, *turn_b = one.combined @ off_by[one.columns]
-            along, turn = by[:, :1] / (1.0 + scale), by[:, 1:] @ so3.left_jacobian(np.array(turn_b))
-            own = np.hstack([along, turn]) @ one.combined
+            by = array_columns(problem, states, self.held(beam_b, off_by, unscaled=one))
+            turn = (1.0 + scale) * by[:, 1:] @ so3.left_jacobian(np.array(turn_b))
+            own = np.hstack([by[:, :1], turn]) @ one.combined
             columns[:, one.columns] = own * one.inside[:, None]
         return columns
 

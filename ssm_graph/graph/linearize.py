@@ -92,7 +92,7 @@ class GraphLinearizer:
         held_b = self.freed.held(instrument.beam_b, off_by)
         prepared = prepared._replace(instrument=instrument._replace(beam_b=held_b))
         rows = self._beams.rows(self._at_beams(states), prepared)
-        own = self.freed.on_beams(self.problem, states, held_b, off_by)
+        own = self.freed.on_beams(self.problem, states, instrument.beam_b, off_by)
         rows.jacobian[:, self.problem.extras.columns(FAULTS)] = own
         return rows._replace(error=rows.error + self.freed.beams @ off_by)
 

@@ -324,8 +324,9 @@ def test_columns_of_the_array_are_the_change_of_the_speeds() -> None:
     np.testing.assert_allclose(columns[:, 1:], of_body, atol=1e-3)
 
 
-def test_a_turn_and_a_scale_of_the_array_are_taken_off_whole() -> None:
-    """The beams that a turned instrument has, 7 deg and 4 %; derivatives by differences."""
+@pytest.mark.parametrize("scale", [0.04, -1.0])
+def test_a_turn_and_a_scale_of_the_array_are_taken_off_whole(scale: float) -> None:
+    """The beams of a turned instrument, 7 deg and 4 %, or zeros; derivatives by differences."""
     problem = build_problem(simulated(perfect_sensors=True, duration_s=20.0).mission)
     beams = problem.beams
     inside = beams.keyframe >= 8
@@ -339,12 +340,12 @@ def test_a_turn_and_a_scale_of_the_array_are_taken_off_whole() -> None:
     freed = replace(none, array=array)
     problem = replace(problem, extras=Extras((*problem.extras.blocks, freed.variable)))
     states = first_values(problem, kernel=KERNEL).states
-    off_by = np.array([0.05, -0.02, 0.12, 0.04])
+    off_by = np.array([0.05, -0.02, 0.12, scale])
 
     def rows_at(off_by: Array) -> BeamRows:
         return GraphLinearizer(problem, freed).beam_rows(states._replace(constants=off_by))
 
-    turned_b = 1.04 * beams.beam_b @ Rotation.from_rotvec(off_by[:3]).as_matrix().T
+    turned_b = (1.0 + scale) * beams.beam_b @ Rotation.from_rotvec(off_by[:3]).as_matrix().T
     moved = replace(problem, beams=replace(beams, beam_b=turned_b))
     as_held = GraphLinearizer(moved, none).beam_rows(states._replace(constants=np.zeros(4)))
     as_stated = rows_at(np.zeros(4))
