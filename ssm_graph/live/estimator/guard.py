@@ -42,9 +42,10 @@ class Guard(NamedTuple):
     levels: Array
     """(K, 3) time, s, and protection levels, m, of all keyframes that have not settled"""
 
-    def covering(self, covariance: Array) -> Array:
-        """Return the covariance (n, n) of an answer with what jumps may have moved it by."""
-        return covariance + self.lanes.jumps.unexcluded(len(covariance))
+    @property
+    def time_s(self) -> float:
+        """Of the keyframe, s."""
+        return float(self.levels[-1, 0])
 
     def pack(self) -> Iterator[tuple[str, Array]]:
         """Yield name and array of all but the contradictions."""
@@ -138,7 +139,18 @@ class Guardian:
 
     def sentence(self, guard: Guard) -> str:
         """Say what contradicts the answer; an empty text where nothing does."""
-        return self.judge.sentence(guard.lanes, guard.contradictions)
+        return self.judge.sentence(guard.lanes, guard.contradictions, guard.time_s)
+
+    def covering(self, guard: Guard, covariance: Array) -> Array:
+        """Return the covariance (n, n) of an answer with what it may be off by beside its noise.
+
+        That is what jumps of a bias may have moved it by, and how far the lanes of suspicions that
+        are not decided are from it.
+        """
+        n, lanes = len(covariance), guard.lanes
+        lasting = self.judge.undecided(guard.contradictions, guard.time_s)
+        off = lanes.deviation[self.bank.held[[one.suspect for one in lasting]], :n]
+        return np.asarray(covariance + lanes.jumps.unexcluded(n) + off.T @ off)
 
     def _shortfall(self, guard: Guard) -> str:
         """Say that the answer is protected worse than was asked for, if so."""
