@@ -14,6 +14,7 @@ import pytest
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import POSITION
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.live.estimator import ONLINE, FixedLagSmoother, IntegrityConfig
 from ssm_graph.live.estimator.guard import Guardian
@@ -254,7 +255,8 @@ def test_a_suspicion_that_stays_one_is_covered_by_sigmas() -> None:
         judged = guard._replace(lanes=now, contradictions=(one,))
         assert (guardian.told(judged).contradiction == "") == is_covered
         grown = guardian.covering(judged, covariance) - guardian.covering(guard, covariance)
-        assert grown[3, 3] == pytest.approx(off_m**2 * is_covered, abs=1e-12)
+        covered = off_m**2 * is_covered * np.array([2.0, 1.0, 1.0])
+        np.testing.assert_allclose(np.diag(grown)[POSITION], covered, atol=1e-12)
 
 
 def test_a_jump_of_the_gyros_bias_is_found_by_lanes_that_forgot_it() -> None:

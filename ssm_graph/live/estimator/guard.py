@@ -11,6 +11,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import POSITION, VELOCITY
 from ssm_graph.engine.states import States
 from ssm_graph.live.estimator.lanes import FIXES, SUSPECT_OF, LaneBank, Lanes
 from ssm_graph.live.estimator.separation import (
@@ -145,12 +146,16 @@ class Guardian:
         """Return the covariance (n, n) of an answer with what it may be off by beside its noise.
 
         That is what jumps of a bias may have moved it by, and how far the lanes of suspicions that
-        are not decided are from it.
+        are not decided are from it: in velocity and position in any direction, for where another
+        sensor lies than the suspected one, the lane is off as well.
         """
         n, lanes = len(covariance), guard.lanes
         lasting = self.judge.undecided(guard.contradictions, guard.time_s)
         off = lanes.deviation[self.bank.held[[one.suspect for one in lasting]], :n]
-        return np.asarray(covariance + lanes.jumps.unexcluded(n) + off.T @ off)
+        grown = np.asarray(covariance + lanes.jumps.unexcluded(n) + off.T @ off)
+        for part in (VELOCITY, POSITION):
+            grown[part, part] += np.sum(off[:, part] ** 2) * np.eye(part.stop - part.start)
+        return grown
 
     def _shortfall(self, guard: Guard) -> str:
         """Say that the answer is protected worse than was asked for, if so."""
