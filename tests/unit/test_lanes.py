@@ -272,6 +272,9 @@ def test_a_jump_of_the_gyros_bias_is_found_by_lanes_that_forgot_it() -> None:
     _, known = judge.judged(now, judge.separations(now), (), 100.0)
     assert [bank.suspects[one.suspect] for one in known] == [INERTIAL]
     assert judge.sentence(now, known, 100.0).startswith("the inertial data: without the gyro bias")
+    unfixed = now._replace(n_fixes=np.zeros(len(bias)))
+    said = judge.sentence(unfixed, known, 100.0)
+    assert said.startswith("the inertial data or DVL: without the gyro bias")
 
 
 def test_what_the_window_refuses_pulls_at_no_lane() -> None:

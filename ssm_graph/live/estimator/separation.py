@@ -354,6 +354,8 @@ class Judge:
         has_fixes = lanes.n_fixes[self._bank.held[blamed[0].suspect]] > 0.0
         if DVL in said and INERTIAL not in said and not (has_fixes and len(known) == 1):
             said.append(INERTIAL)
+        elif INERTIAL in said and DVL not in said and DVL in names and not has_fixes:
+            said.append(DVL)  # without fixes it is all that biases of gyros are told by
         name, unit, factor = SAID[first.part]
         is_inertial = names[first.suspect] == INERTIAL
         without = "the gyro bias of before" if is_inertial else names[first.suspect]
