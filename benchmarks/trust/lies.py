@@ -241,6 +241,12 @@ def any_gyro_jumps(rng: Rng, end_s: float) -> Fault:
     return Fault(sensor=Sensor.GYROS, start_s=start_s, size=size, axes=axes)
 
 
+def imu_clock_set(rng: Rng, end_s: float) -> Fault:
+    """Draw a clock of the inertial data that is set forward by 0.05 to 1 s."""
+    size = math.exp(rng.uniform(math.log(0.05), math.log(1.0)))
+    return _imu(Sensor.IMU, FaultShape.CLOCK, _onset(rng, end_s), math.inf, size=size)
+
+
 LIES = {
     "two opposite beams, ±0.03 to 0.08 m/s, 100 to 200 s": Lie(two_opposite, ("DVL",)),
     "two adjacent beams, 0.04 to 0.1 m/s, 60 to 150 s": Lie(two_beams, ("DVL",)),
@@ -287,6 +293,9 @@ LIVE = {
     "water taken for the bottom, 0.2 to 0.4 m/s": Lie(water_later, ("DVL",)),
     "bias of the vertical gyro jumps by 0.02 to 0.1 deg/s": Lie(
         gyro_jumps, (*INERTIAL, "inertial")
+    ),
+    "clock of the inertial data is set forward by 0.05 to 1 s": Lie(
+        imu_clock_set, (*INERTIAL, "inertial", "clock")
     ),
     "compass 8 to 20 deg off, 60 to 150 s": Lie(compass_off, ("compass",), with_compass=True),
 }

@@ -14,11 +14,12 @@ import pytest
 
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import POSITION
 from ssm_graph.io.mission_folder.vehicle import vehicle_of
 from ssm_graph.live.estimator import ONLINE, FixedLagSmoother, IntegrityConfig
 from ssm_graph.live.estimator.guard import Guardian
 from ssm_graph.live.estimator.lanes import INERTIAL, MEASURE, Lanes
-from ssm_graph.live.estimator.separation import AGREED_S, UNASKED, Contradiction
+from ssm_graph.live.estimator.separation import AGREED_S, COVERED_S, UNASKED, Contradiction
 from ssm_graph.mission.mission import Mission
 from ssm_graph.mission.navigation import Health
 from ssm_graph.simulation import Grade, SimulatedMission
@@ -223,7 +224,7 @@ def test_a_suspicion_ends_with_any_lane_that_agrees() -> None:
 
     (one,) = suspected = judged(0.55, 0.1, (), 100.0)
     assert not one.is_certain
-    said = guardian.judge.sentence(lanes, suspected)
+    said = guardian.judge.sentence(lanes, suspected, 100.0)
     assert "noise alone would hardly" in said
     assert said.endswith("mission.toml say so: [gnss] drift_sigma_m")
     (more,) = judged(3.0, 0.1, suspected, 103.0)
@@ -232,6 +233,30 @@ def test_a_suspicion_ends_with_any_lane_that_agrees() -> None:
     for k in range(int(AGREED_S) + 2):
         suspected = judged(0.0, 10.0, suspected, 104.0 + k)
     assert suspected == ()
+
+
+def test_a_suspicion_that_stays_one_is_covered_by_sigmas() -> None:
+    """After a minute it is said no more; until it ends the sigmas hold what it would mean."""
+    smoother = after("calm")[1]
+    guardian, lanes = guardian_of(smoother)
+    course = smoother._course
+    assert course is not None
+    off_m, bank = 0.45, guardian.bank
+    now = held_off(lanes, guardian, off_m, 0.1)
+    guard, covariance = course.newest.guard, course.newest.window.newest_covariance
+    assert guardian.covering(guard, covariance)[3, 3] < covariance[3, 3] + 0.1 * off_m**2
+    for age_s, is_certain, is_covered in (
+        (COVERED_S - 1.0, False, False),
+        (COVERED_S + 1.0, False, True),
+        (COVERED_S + 1.0, True, False),
+    ):
+        since_s, suspect = guard.time_s - age_s, bank.suspects.index("GNSS")
+        one = Contradiction(suspect, since_s, since_s, 1, 0.55, 30.0, np.inf, is_certain)
+        judged = guard._replace(lanes=now, contradictions=(one,))
+        assert (guardian.told(judged).contradiction == "") == is_covered
+        grown = guardian.covering(judged, covariance) - guardian.covering(guard, covariance)
+        covered = off_m**2 * is_covered * np.array([2.0, 1.0, 1.0])
+        np.testing.assert_allclose(np.diag(grown)[POSITION], covered, atol=1e-12)
 
 
 def test_a_jump_of_the_gyros_bias_is_found_by_lanes_that_forgot_it() -> None:
@@ -246,7 +271,10 @@ def test_a_jump_of_the_gyros_bias_is_found_by_lanes_that_forgot_it() -> None:
     now = lanes._replace(deviation=deviation, n_out=np.ones(len(bias)))
     _, known = judge.judged(now, judge.separations(now), (), 100.0)
     assert [bank.suspects[one.suspect] for one in known] == [INERTIAL]
-    assert judge.sentence(now, known).startswith("the inertial data: without the gyro bias")
+    assert judge.sentence(now, known, 100.0).startswith("the inertial data: without the gyro bias")
+    unfixed = now._replace(n_fixes=np.zeros(len(bias)))
+    said = judge.sentence(unfixed, known, 100.0)
+    assert said.startswith("the inertial data or DVL: without the gyro bias")
 
 
 def test_what_the_window_refuses_pulls_at_no_lane() -> None:
@@ -276,6 +304,28 @@ def test_what_only_followed_ends_with_what_it_followed() -> None:
         found.sigma[:, 2] = 1.0
         _, left = guardian.judge.judged(quiet, found, known, 110.0 + AGREED_S + 1.0)
         assert [names[one.suspect] for one in left] == [INERTIAL] * is_left
+
+
+def test_a_blame_that_is_refuted_clears_nobody() -> None:
+    """Inertial data were blamed first, then their lane misses its own sensors: the DVL stays."""
+    guardian, lanes = guardian_of(after("calm")[1])
+    bank, names = guardian.bank, guardian.bank.suspects
+    dvl, inertial = names.index("DVL"), names.index(INERTIAL)
+    known = (
+        Contradiction(dvl, 101.0, 109.0, 0, 0.05, 30.0, np.inf),
+        Contradiction(inertial, 99.0, 109.0, 2, 1e-4, 90.0, np.inf),
+    )
+    held = bank.held[[dvl, inertial]]
+    begun_s, misfit = lanes.begun_s.copy(), np.zeros_like(lanes.misfit)
+    begun_s[held], misfit[held[1]] = 90.0, 2.0 * guardian.judge.threshold
+    deviation = np.zeros_like(lanes.deviation)
+    deviation[held[0], 6] = 5.0
+    n_out = np.ones(len(begun_s))
+    now = lanes._replace(begun_s=begun_s, misfit=misfit, deviation=deviation, n_out=n_out)
+    left_on, left = guardian.judge.judged(now, guardian.judge.separations(now), known, 110.0)
+    assert [names[one.suspect] for one in left] == ["DVL"]
+    assert left_on.begun_s[held[0]] == pytest.approx(90.0)
+    assert np.isinf(left_on.begun_s[held[1]])
 
 
 def test_the_threshold_keeps_the_rate_that_was_asked_for() -> None:

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from ssm_graph.live.estimator import ONLINE, FixedLagSmoother
+from ssm_graph.live.estimator.intake import Intake
+from ssm_graph.mission.events import EventLog
 from ssm_graph.mission.navigation import Health, Navigation
 from ssm_graph.sensors.depth import DepthReading
 from ssm_graph.sensors.dvl import Ping
@@ -46,6 +48,17 @@ def test_a_clock_far_ahead_begins_anew() -> None:
     smoother = pushed(given)
     assert smoother.status()[0] is Health.ALIGNING
     assert {"clock_gap", "lost"} <= kinds(smoother)
+
+
+def test_a_clock_of_the_inertial_data_that_is_set_forward_a_little_is_told() -> None:
+    """Once, with by how much; nothing is told of samples that come one after the other."""
+    for set_s, expected in ((0.0, []), (0.2, ["no inertial sample for 0.2 s"])):
+        events = EventLog()
+        intake = Intake(stream(12.0)[1], events)
+        for sample in (m for m in messages() if isinstance(m, ImuSample)):
+            intake.accept(replace(sample, time_s=sample.time_s + set_s * (sample.time_s > 11.0)))
+        told = [event.text.split(":")[0] for event in events.take() if event.kind == "imu_skipped"]
+        assert told == expected
 
 
 def test_pings_off_the_water_do_not_count() -> None:

@@ -207,7 +207,7 @@ class Course:
                 severity = Severity.WARNING if is_certain else Severity.INFO
                 self._events.tell(keyframe.time_s, severity, kind.replace(" ", "_"), text)
         for suspect in sorted(known.keys() - now.keys()):
-            text = f"the answer agrees again with what is independent of {names[suspect]}"
+            text = f"nothing independent of {names[suspect]} contradicts the answer any more"
             kind = "contradiction_ended" if known[suspect] else "suspicion_ended"
             self._events.tell(keyframe.time_s, Severity.INFO, kind, text)
         return guard

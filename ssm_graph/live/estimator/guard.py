@@ -11,6 +11,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from ssm_graph.base.frozen import Array
+from ssm_graph.engine.error_state import POSITION, VELOCITY
 from ssm_graph.engine.states import States
 from ssm_graph.live.estimator.lanes import FIXES, SUSPECT_OF, LaneBank, Lanes
 from ssm_graph.live.estimator.separation import (
@@ -42,9 +43,10 @@ class Guard(NamedTuple):
     levels: Array
     """(K, 3) time, s, and protection levels, m, of all keyframes that have not settled"""
 
-    def covering(self, covariance: Array) -> Array:
-        """Return the covariance (n, n) of an answer with what jumps may have moved it by."""
-        return covariance + self.lanes.jumps.unexcluded(len(covariance))
+    @property
+    def time_s(self) -> float:
+        """Of the keyframe, s."""
+        return float(self.levels[-1, 0])
 
     def pack(self) -> Iterator[tuple[str, Array]]:
         """Yield name and array of all but the contradictions."""
@@ -138,7 +140,22 @@ class Guardian:
 
     def sentence(self, guard: Guard) -> str:
         """Say what contradicts the answer; an empty text where nothing does."""
-        return self.judge.sentence(guard.lanes, guard.contradictions)
+        return self.judge.sentence(guard.lanes, guard.contradictions, guard.time_s)
+
+    def covering(self, guard: Guard, covariance: Array) -> Array:
+        """Return the covariance (n, n) of an answer with what it may be off by beside its noise.
+
+        That is what jumps of a bias may have moved it by, and how far the lanes of suspicions that
+        are not decided are from it: in velocity and position in any direction, for where another
+        sensor lies than the suspected one, the lane is off as well.
+        """
+        n, lanes = len(covariance), guard.lanes
+        lasting = self.judge.undecided(guard.contradictions, guard.time_s)
+        off = lanes.deviation[self.bank.held[[one.suspect for one in lasting]], :n]
+        grown = np.asarray(covariance + lanes.jumps.unexcluded(n) + off.T @ off)
+        for part in (VELOCITY, POSITION):
+            grown[part, part] += np.sum(off[:, part] ** 2) * np.eye(part.stop - part.start)
+        return grown
 
     def _shortfall(self, guard: Guard) -> str:
         """Say that the answer is protected worse than was asked for, if so."""

@@ -5,7 +5,8 @@ that) parts from that of the lane with all sensors by more than noise would at t
 false alerts. A step shows only while a lane is there that began before it; so a contradiction is
 remembered, and the lane that found it first is led on without its sensor, until that lane, by what
 is independent of the sensor, can say that the answer is right. What parts by less is a suspicion:
-it lasts until that lane agrees, whatever it can tell.
+it lasts until that lane agrees, whatever it can tell. One that has not become certain within a
+minute is said no more: until it ends the sigmas cover what it would mean.
 """
 
 from __future__ import annotations
@@ -63,6 +64,10 @@ UNASKED: Final = 0.01
 than a tenth of its own sigma is not asked for."""
 AGREED_S: Final = 8.0
 """A contradiction or suspicion ends once the lane that is led on has agreed for so long."""
+COVERED_S: Final = LENGTHS_S[1]
+"""A suspicion so old is covered by sigmas: what goes on has parted lanes for certain by then, and
+no lane begun since tells one that noise has made from one that stays small. The bias of a gyro
+falsely suspected at tactical grade takes a lane minutes to find again."""
 AT_EASE: Final = 0.05
 """It agrees where noise alone would part it by more in so many cases."""
 DOUBTED_S: Final = 30.0
@@ -242,7 +247,7 @@ class Judge:
             elif was is not None:
                 still = self._still(was, lanes, found, time_s)
                 if still is None:
-                    others = self._consequences(was, known)
+                    others = self._consequences(was, lanes, known)
                     over |= {suspect, *others}
                     kept = {s: one for s, one in kept.items() if s not in over}
                     lanes = self._bank.let_go(lanes, suspect, others, time_s)
@@ -250,14 +255,17 @@ class Judge:
                     kept[suspect] = still
         return lanes, tuple(self._weighed(one, lanes, time_s) for one in kept.values())
 
-    def _consequences(self, was: Contradiction, known: tuple[Contradiction, ...]) -> list[int]:
+    def _consequences(
+        self, was: Contradiction, lanes: Lanes, known: tuple[Contradiction, ...]
+    ) -> list[int]:
         """Return the suspects whose contradiction ends with that of another one.
 
         They began after it and were not blamed. The lanes of the inertial data had followed the
-        DVL, and that a lane without DVL agrees speaks for these data as well.
+        DVL, and that a lane without DVL agrees speaks for these data as well. One whose lane is
+        refuted was blamed by mistake: that ends no other.
         """
         names, blamed = self._bank.suspects, {one.suspect for one in self.blamed(known)}
-        if was.suspect not in blamed:
+        if was.suspect not in blamed or self.is_refuted(lanes)[self._bank.held[was.suspect]]:
             return []
         spared = {names.index(INERTIAL)} if names[was.suspect] == DVL else set()
         later = [one.suspect for one in known if one.since_s > was.since_s]
@@ -331,9 +339,14 @@ class Judge:
         least = min(RIVAL * best, best - NEAR)
         return [one for one in order if one.evidence >= least]
 
-    def sentence(self, lanes: Lanes, known: tuple[Contradiction, ...]) -> str:
+    def undecided(self, known: tuple[Contradiction, ...], time_s: float) -> list[Contradiction]:
+        """Return the suspicions that are covered by sigmas."""
+        return [one for one in known if not one.is_certain and time_s - one.since_s > COVERED_S]
+
+    def sentence(self, lanes: Lanes, known: tuple[Contradiction, ...], time_s: float) -> str:
         """Say which sensors contradict the answer; an empty text where none does."""
-        blamed = self.blamed(known)
+        covered = self.undecided(known, time_s)
+        blamed = self.blamed(tuple(one for one in known if one not in covered))
         if not blamed:
             return ""
         names, first = self._bank.suspects, blamed[0]
@@ -341,6 +354,8 @@ class Judge:
         has_fixes = lanes.n_fixes[self._bank.held[blamed[0].suspect]] > 0.0
         if DVL in said and INERTIAL not in said and not (has_fixes and len(known) == 1):
             said.append(INERTIAL)
+        elif INERTIAL in said and DVL not in said and DVL in names and not has_fixes:
+            said.append(DVL)  # without fixes it is all that biases of gyros are told by
         name, unit, factor = SAID[first.part]
         is_inertial = names[first.suspect] == INERTIAL
         without = "the gyro bias of before" if is_inertial else names[first.suspect]

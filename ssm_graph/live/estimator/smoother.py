@@ -308,11 +308,12 @@ class FixedLagSmoother:
 
     def _tail_of(self, step: Step) -> Tail:
         assert self._frame is not None
-        window = step.window
+        assert self._made is not None
+        window, guardian = step.window, self._made.guardian
         tail = Tail(
             window.keyframes[-1],
             window.newest_states,
-            step.guard.covering(window.newest_covariance),
+            guardian.covering(step.guard, window.newest_covariance),
             noise=self.vehicle.imu_noise,
             frame=self._frame,
             inertial=window.inertial,
