@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from factors.bearing_range import half_turn
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.systems.landmark_slam.association import (
@@ -17,6 +18,7 @@ from ssm_graph.systems.landmark_slam.association import (
 )
 from ssm_graph.systems.landmark_slam.filtered import filtered
 from ssm_graph.systems.landmark_slam.logs import LONGEST_STEP_S, LandmarkLog, problem_of_log
+from ssm_graph.systems.landmark_slam.models import between, composed
 from ssm_graph.systems.landmark_slam.problem import UNKNOWN, SlamNoise
 from ssm_graph.systems.landmark_slam.reassociation import reassociate
 from ssm_graph.systems.landmark_slam.solve import Asked, solve
@@ -97,6 +99,23 @@ def test_what_odometry_is_wrong_by_becomes_known() -> None:
         true = np.column_stack([np.interp(problem.time_s, log.truth_s, x) for x in log.truth.T])
         errors_m.append(np.sqrt(np.mean(np.sum((answer.pose - true)[:, :2] ** 2, axis=1))))
     assert errors_m[1] < 3.0 * errors_m[0] + 0.1
+
+
+def test_steps_put_together_follow_the_drift_as_they_do_one_by_one() -> None:
+    """Over 50 s in which nothing is seen: a rate of turn bends the way, not its end alone."""
+    log = drive(RING, seen_s=((0.0, 10.0), (60.0, 120.0)))
+    problem = problem_of_log(log)
+    short, _, kept = problem.condensed(log.noise)
+    drift = np.array([0.02, 0.003, 0.001])
+    bent = [problem.start]
+    for step in problem.steps(drift):
+        bent.append(composed(bent[-1], step))
+    wanted = between(np.array(bent)[kept[:-1]], np.array(bent)[kept[1:]])
+    missed = wanted - short.steps(drift)
+    missed[:, 2] = half_turn(missed[:, 2])
+    by_drift = short.steps(drift) - short.steps()
+    assert np.abs(by_drift[:, :2]).max() > 0.1
+    assert np.abs(missed).max() < 0.02
 
 
 def test_after_a_blind_stretch_no_landmark_is_believed_at_once() -> None:
