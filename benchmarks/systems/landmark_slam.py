@@ -93,10 +93,10 @@ def real(robots: Sequence[tuple[int, int]], ways: dict[str, Asked]) -> Iterator[
     rows, scores = [], []
     for number, robot in robots:
         for name, asked in ways.items():
-            note(f"robot {number}-{robot}, {name}")
             began = time.process_time()
             solved = solve_input(_mrclam(number), replace(asked, robot=robot))
             rows.append(_told(f"{number}-{robot}", name, solved, began))
+            note(" | ".join(rows[-1]))
             assert solved.score is not None
             scores.append((name, solved.score.position_m, solved.score.aligned_m))
     yield "MRCLAM, set and robot; unknown landmarks, frame of the start; noise guessed, see"

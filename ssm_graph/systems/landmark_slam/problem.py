@@ -207,6 +207,7 @@ class SlamStatus(Enum):
     CONVERGED = "updates below 1e-2 of their sigmas, weights settled"
     MAX_ITERATIONS = "iteration limit reached: look at the start, or at odometry that jumps"
     DONE = "the whole log was filtered"
+    AMBIGUOUS = "landmarks without names may have been taken for one another: see the notes"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
