@@ -64,8 +64,11 @@ from ssm_graph.systems.landmark_slam.recorded import (
 from ssm_graph.systems.landmark_slam.smoother import SmootherSettings, Values, smooth_landmarks
 
 NO_TRUTH: Final = np.zeros((0, 3))
+PAIRED_ONCE: Final = (
+    "landmarks without names: paired as they came, and not looked at again; the smoother does"
+)
 FAR_SIGMAS: Final = 3.0
-"""By which a path is another one."""
+"""By which a path is another one: what a normal error exceeds once in 400 times."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,6 +250,7 @@ def solve(
             found = associate(problem, noise, pairing)
             named, first = found.problem, Values(found.pose, found.places)
             landmark = found.landmark
+            notes = (*notes, PAIRED_ONCE)
         if np.all(problem.landmark != UNKNOWN):
             errors = association_errors(landmark, problem.landmark)
     sigmas: tuple[SigmaFound, ...] = ()
@@ -280,9 +284,9 @@ def _with_doubt(answer: SlamEstimate, elsewhere_m: Array) -> SlamEstimate:
     if not is_off.any():
         return answer
     note = (
-        f"landmarks without names: another pairing explains the log as well, and puts "
-        f"{int(is_off.sum())} of {len(is_off)} poses up to {elsewhere_m.max():.2f} m elsewhere; "
-        "sigmas hold for this pairing alone"
+        "landmarks without names: with a little more or less trust in the observations they pair "
+        f"otherwise, and {int(is_off.sum())} of {len(is_off)} poses are up to "
+        f"{elsewhere_m.max():.2f} m elsewhere; sigmas hold for this pairing alone"
     )
     settled = answer.status is SlamStatus.CONVERGED
     status = SlamStatus.AMBIGUOUS if settled else answer.status

@@ -19,7 +19,7 @@ from ssm_graph.systems.landmark_slam.association import (
 from ssm_graph.systems.landmark_slam.filtered import filtered
 from ssm_graph.systems.landmark_slam.logs import LONGEST_STEP_S, LandmarkLog, problem_of_log
 from ssm_graph.systems.landmark_slam.models import between, composed
-from ssm_graph.systems.landmark_slam.problem import UNKNOWN, SlamNoise
+from ssm_graph.systems.landmark_slam.problem import UNKNOWN, SlamNoise, SlamStatus
 from ssm_graph.systems.landmark_slam.reassociation import reassociate
 from ssm_graph.systems.landmark_slam.solve import Asked, solve
 
@@ -167,6 +167,20 @@ def test_a_filter_goes_through_unnamed_landmarks_that_stand_together() -> None:
     assert np.isfinite(solved.answer.landmarks).all()
 
 
+@pytest.mark.slow
+def test_pairs_that_hang_on_trust_are_told() -> None:
+    """Landmarks too close for ranges that are worse than stated, after blind stretches."""
+    rng = np.random.default_rng(0)
+    places = np.vstack([RING + rng.normal(0.0, 0.25, (5, 2)) for _ in range(3)])
+    log = drive(places, seen_s=((0.0, 25.0), (60.0, 70.0), (105.0, 120.0)), wrong=0.02)
+    seen = log.seen + rng.normal(0.0, 0.15, (len(log.seen), 1)) * [1.0, 0.2]
+    log = replace(log, seen=seen)
+    solved = solve(problem_of_log(log), log.noise, Asked(association=Association.JOINT))
+    assert solved.answer.status is SlamStatus.AMBIGUOUS
+    assert not solved.is_good
+    assert "pair otherwise" in " ".join(solved.notes)
+
+
 def test_a_filter_without_any_landmark_answers() -> None:
     """One sighting makes none: the path is the odometry's."""
     log = drive(RING, seen_s=((0.0, 20.0),))
@@ -201,9 +215,11 @@ def test_unnamed_is_nearly_as_good_as_named() -> None:
     problem = problem_of_log(log)
     true = np.column_stack([np.interp(problem.time_s, log.truth_s, x) for x in log.truth.T])
     named, unnamed = (
-        solve(problem, log.noise, Asked(association=kind), truth=true).score
+        solve(problem, log.noise, Asked(association=kind), truth=true)
         for kind in (Association.KNOWN, Association.JOINT)
     )
-    assert named is not None
-    assert unnamed is not None
-    assert unnamed.aligned_m < 1.2 * named.aligned_m + 0.01
+    assert named.score is not None
+    assert unnamed.score is not None
+    assert unnamed.score.aligned_m < 1.2 * named.score.aligned_m + 0.01
+    assert unnamed.answer.status is SlamStatus.CONVERGED
+    assert unnamed.is_good
