@@ -1,6 +1,6 @@
 """Landmark SLAM: smoother and noise on simulated runs, real logs against their truth.
 
-A page for each part; of what takes landmarks without names, and of what goes pose by pose, too.
+A page for each part: `online` is of what goes pose by pose, on MRCLAM.
 """
 
 from __future__ import annotations
@@ -26,16 +26,14 @@ from ssm_graph.systems.landmark_slam.study import Scores, run_batch
 CASES = ("stated", "R3", "Q3", "gross10", "gross30")
 METHODS = ("smoother", "smoother-em", "smoother-oracle")
 SIGMAS = ("distance", "steering", "range", "bearing")
-NAMED = "smoother"
-UNNAMED = "smoother, landmarks without names"
 WAYS = {
     "mrclam": {
-        NAMED: Asked(),
+        "smoother": Asked(),
+        "smoother, landmarks without names": Asked(association=Association.JOINT),
         "smoother, noise as guessed": Asked(learns_observations=False),
         "on-line filter, similarity weights": Asked("ekf-weighted"),
         "literal noise-adaptive filter": Asked("naukf"),
     },
-    "unnamed": {NAMED: Asked(), UNNAMED: Asked(association=Association.JOINT)},
     "online": {
         "isam2, nothing dropped": Asked("isam2"),
         "fixed lag of 60 s": Asked("fixed-lag", lag_s=60.0),
@@ -217,7 +215,7 @@ def main() -> None:
         Option("--steps", 2000, "of each run"),
         Option("--first-seed", 2000, "of the simulated runs"),
         Option("--robots", [1, 2, 3, 4, 5], "of MRCLAM 6"),
-        Option("--robots-of-7", [1, 2, 3, 4, 5], "of MRCLAM 7"),
+        Option("--robots-of-7", [4, 5], "of MRCLAM 7"),
         Option("--parts", list(PARTS), "a page each; real logs where the data are there", PARTS),
     )
     asked = report.args
