@@ -1,4 +1,7 @@
-"""Landmark SLAM: smoother and noise on simulated runs, real logs against their truth."""
+"""Landmark SLAM: smoother and noise on simulated runs, real logs against their truth.
+
+A page for each part: `online` is of what goes pose by pose, on MRCLAM.
+"""
 
 from __future__ import annotations
 
@@ -24,14 +27,19 @@ CASES = ("stated", "R3", "Q3", "gross10", "gross30")
 METHODS = ("smoother", "smoother-em", "smoother-oracle")
 SIGMAS = ("distance", "steering", "range", "bearing")
 WAYS = {
-    "smoother": Asked(),
-    "smoother, noise as guessed": Asked(learns_observations=False),
-    "isam2, nothing dropped": Asked("isam2"),
-    "fixed lag of 60 s": Asked("fixed-lag", lag_s=60.0),
-    "on-line filter, similarity weights": Asked("ekf-weighted"),
-    "literal noise-adaptive filter": Asked("naukf"),
-    "smoother, landmarks without names": Asked(association=Association.JOINT),
+    "mrclam": {
+        "smoother": Asked(),
+        "smoother, landmarks without names": Asked(association=Association.JOINT),
+        "smoother, noise as guessed": Asked(learns_observations=False),
+        "on-line filter, similarity weights": Asked("ekf-weighted"),
+        "literal noise-adaptive filter": Asked("naukf"),
+    },
+    "online": {
+        "isam2, nothing dropped": Asked("isam2"),
+        "fixed lag of 60 s": Asked("fixed-lag", lag_s=60.0),
+    },
 }
+PARTS = ("simulated", *WAYS, "victoria")
 NEWEST = 10
 """Times, evenly spread, at which the newest pose is looked at: each is a solution of its own."""
 DATA = Path(os.environ.get("SSM_GRAPH_DATA", ROOT.parent / "shared" / "data")) / "systems"
@@ -78,28 +86,45 @@ def simulated(runs: int, steps: int, first_seed: int) -> Iterator[str]:
     yield from table(("case", *SIGMAS), noises)
 
 
-def real(folder: Path, robots: Sequence[int]) -> Iterator[str]:
-    """Yield the table of robots."""
-    rows = []
-    for robot in robots:
-        for name, asked in WAYS.items():
-            note(f"robot {robot}, {name}")
+def real(robots: Sequence[tuple[int, int]], ways: dict[str, Asked]) -> Iterator[str]:
+    """Yield the table of robots, each (number of the set, its own), and what sums it up."""
+    rows, scores = [], []
+    for number, robot in robots:
+        for name, asked in ways.items():
             began = time.process_time()
-            asked = replace(asked, robot=robot)
-            rows.append(_told(str(robot), name, solve_input(folder, asked), began))
-    yield ""
-    yield f"{folder.name}, unknown landmarks, frame of the start; noise guessed, see `recorded.py`,"
-    yield "that of the smoother's observations found in the log where nothing else is said."
+            solved = solve_input(_mrclam(number), replace(asked, robot=robot))
+            rows.append(_told(f"{number}-{robot}", name, solved, began))
+            note(" | ".join(rows[-1]))
+            assert solved.score is not None
+            scores.append((name, solved.score.position_m, solved.score.aligned_m))
+    yield "MRCLAM, set and robot; unknown landmarks, frame of the start; noise guessed, see"
+    yield "`recorded.py`, that of the smoother's observations from the log where no more is said."
     yield ""
     header = ("robot", "method", "position rms, m", "aligned, m", "heading rms, deg")
-    yield from table((*header, "association wrong, left out", "CPU s"), rows)
+    yield from table((*header, "association wrong, left out", "status", "CPU s"), rows)
+    yield ""
+    sums = []
+    for name in ways:
+        own = np.array([score[1:] for score in scores if score[0] == name])
+        middle, worst = np.median(own, axis=0), own.max(axis=0)
+        over = own[:, 1] / [score[2] for score in scores if score[0] == next(iter(ways))]
+        numbers = (middle[0], worst[0], middle[1], worst[1], np.median(over), over.max())
+        sums.append((name, *(f"{x:.3f}" for x in numbers)))
+    of_position = ("position: median of robots", "worst")
+    of_aligned = ("aligned: median", "worst", f"aligned, over {next(iter(ways))}: median", "worst")
+    yield from table(("method", *of_position, *of_aligned), sums)
 
 
-def newest(folder: Path, robots: Sequence[int]) -> Iterator[str]:
+def _mrclam(number: int) -> Path:
+    return DATA / "mrclam" / f"MRCLAM_Dataset{number}"
+
+
+def newest(robots: Sequence[tuple[int, int]]) -> Iterator[str]:
     """Yield the table of what the newest pose is worth, whoever finds it."""
     rows = []
-    for robot in robots:
-        note(f"robot {robot}, newest pose")
+    for number, robot in robots:
+        note(f"robot {number}-{robot}, newest pose")
+        folder = _mrclam(number)
         whole = solve_input(folder, Asked(robot=robot))
         problem, noise = whole.problem, whole.answer.noise
         at = np.linspace(0, len(problem.time_s) - 1, NEWEST + 1).astype(int)[1:]
@@ -112,9 +137,9 @@ def newest(folder: Path, robots: Sequence[int]) -> Iterator[str]:
             float(np.sqrt(np.mean(np.sum((pose - whole.truth[at])[:, :2] ** 2, axis=1))))
             for pose in (whole.answer.pose[at], np.array(until), learnt, guessed)
         ]
-        rows.append((str(robot), str(len(at)), *(f"{error:.3f}" for error in errors)))
+        rows.append((f"{number}-{robot}", str(len(at)), *(f"{error:.3f}" for error in errors)))
     yield ""
-    yield f"{folder.name}, the newest pose at {NEWEST} times: rms in the frame of the start, m. The"
+    yield f"The newest pose at {NEWEST} times: rms in the frame of the start, m. The"
     yield "batch has all that was seen until then, and the noise that the whole log tells."
     yield ""
     header = ("robot", "times", "smoother of the whole log", "batch until then")
@@ -149,6 +174,7 @@ def _told(robot: str, name: str, solved: Solved, began: float) -> tuple[str, ...
         f"{score.aligned_m:.3f}",
         "none" if score.heading_deg is None else f"{score.heading_deg:.1f}",
         "names known" if errors is None else f"{errors.n_wrong}, {errors.n_left_out} of {errors.n}",
+        solved.answer.status.name,
         f"{time.process_time() - began:.1f}",
     )
 
@@ -174,7 +200,6 @@ def victoria(folder: Path) -> Iterator[str]:
                     "; ".join(solved.answer.notes),
                 )
             )
-    yield ""
     yield "Victoria Park; of the raw log the rms against GPS after a turn and a shift."
     yield ""
     yield from table(("input", "method", "poses", "CPU s", "aligned, m", "notes"), rows)
@@ -189,19 +214,23 @@ def main() -> None:
         Option("--runs", 4, "simulated runs of each case"),
         Option("--steps", 2000, "of each run"),
         Option("--first-seed", 2000, "of the simulated runs"),
-        Option("--robots", [1, 2, 3, 4, 5], "of MRCLAM 6; without data none"),
+        Option("--robots", [1, 2, 3, 4, 5], "of MRCLAM 6"),
         Option("--robots-of-7", [4, 5], "of MRCLAM 7"),
+        Option("--parts", list(PARTS), "a page each; real logs where the data are there", PARTS),
     )
-    arguments = report.args
-    lines = [*simulated(arguments.runs, arguments.steps, arguments.first_seed)]
-    for number, robots in ((6, arguments.robots), (7, arguments.robots_of_7)):
-        folder = DATA / "mrclam" / f"MRCLAM_Dataset{number}"
-        if folder.is_dir() and robots:
-            lines += real(folder, robots)
-            lines += newest(folder, robots)
-    if (DATA / "victoria_park").is_dir() and arguments.robots:
-        lines += victoria(DATA / "victoria_park")
-    report.write(lines)
+    asked = report.args
+    robots = [(6, robot) for robot in asked.robots] + [(7, robot) for robot in asked.robots_of_7]
+    robots = [one for one in robots if _mrclam(one[0]).is_dir()]
+    for part in asked.parts:
+        if part == "simulated":
+            lines = [*simulated(asked.runs, asked.steps, asked.first_seed)]
+        elif part in WAYS and robots:
+            lines = [*real(robots, WAYS[part]), *(newest(robots) if part == "online" else ())]
+        elif part == "victoria" and (DATA / "victoria_park").is_dir():
+            lines = [*victoria(DATA / "victoria_park")]
+        else:
+            continue
+        report.write(lines, part=part, of=part)
 
 
 if __name__ == "__main__":

@@ -55,7 +55,7 @@ def filter_along(
         start_cov=np.diag(problem.start_sigma**2),
         **more,
     )
-    slopes = problem.drift_slopes(problem.steps())
+    slopes = problem.slopes
 
     def move(k: int) -> None:
         control = begin.control[k - 1][None]

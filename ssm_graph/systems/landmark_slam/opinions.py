@@ -3,7 +3,7 @@
 A filter that goes along cannot take back what it paired wrongly, and a little more or less trust in
 the observations leads it elsewhere. So it goes along several times. Each time the log is smoothed
 and its scans are paired anew along the path; the opinion is taken that bends the odometry least and
-explains most, with the fewest landmarks.
+explains most, with the fewest landmarks. Where the others put the path tells whether it is sure.
 """
 
 from __future__ import annotations
@@ -40,6 +40,8 @@ class Opinion(NamedTuple):
     """(M,) of the log that came, `problem.UNKNOWN` of observations left out"""
     cost: float
     """Of what observations and odometry are missed by, and of the landmarks that it takes."""
+    elsewhere_m: Array
+    """(K,) by which the paths of the other opinions are off this one's, at most"""
 
 
 def best_opinion(
@@ -53,8 +55,11 @@ def best_opinion(
         if len(first.places):
             found.append(_mended(problem, noise, first, settings))
     if not found:  # nothing was seen three times: what the filter says is all there is
-        return Opinion(first.problem, Values(first.pose, first.places), first.landmark, np.inf)
-    return min(found, key=lambda one: one.cost)
+        values, nothing = Values(first.pose, first.places), np.zeros(len(first.pose))
+        return Opinion(first.problem, values, first.landmark, np.inf, nothing)
+    best = min(found, key=lambda one: one.cost)
+    off = np.array([one.values.pose - best.values.pose for one in found])[..., :2]
+    return best._replace(elsewhere_m=np.linalg.norm(off, axis=2).max(axis=0))
 
 
 def _mended(
@@ -70,7 +75,8 @@ def _mended(
     named = problem.associated(again.landmark, names)
     drift = estimate.drift / problem.drift_sigma if len(estimate.drift) else np.zeros(0)
     cost = _cost(again) + float(np.sum(rows.between_error**2) + drift @ drift)
-    return Opinion(named, values._replace(landmarks=again.places), again.landmark, cost)
+    values, nothing = values._replace(landmarks=again.places), np.zeros(len(values.pose))
+    return Opinion(named, values, again.landmark, cost, nothing)
 
 
 def _more(rows: Rows) -> Array:

@@ -50,6 +50,8 @@ class SlamProblem(ReadOnlyArrays):
     rad/s of turn. No rows: nothing."""
     observation_scale: Array | None = None
     """(M, 2) by which the sigmas of each observation are multiplied; None: by 1."""
+    drift_slopes: Array | None = None
+    """(K - 1, 3, 3) by which increments follow the drift; None: what they are themselves."""
 
     def __post_init__(self) -> None:
         n = len(self.time_s)
@@ -79,11 +81,15 @@ class SlamProblem(ReadOnlyArrays):
         q = len(self.motion.labels)
         step = self.motion.increment(self.control, np.zeros((len(self.control), q)))
         if drift is not None and len(drift):
-            step = step + (self.drift_slopes(step) @ drift[:, None])[..., 0]
+            step = step + (self.slopes @ drift[:, None])[..., 0]
         return step
 
-    def drift_slopes(self, step: Array) -> Array:
-        """Return how increments (K - 1, 3) follow the drift, (K - 1, 3, 3)."""
+    @property
+    def slopes(self) -> Array:
+        """(K - 1, 3, 3) by which increments follow the drift."""
+        if self.drift_slopes is not None:
+            return self.drift_slopes
+        step = self.steps()
         slopes = np.zeros((len(step), 3, 3))
         slopes[:, :2, 0] = step[:, :2]
         slopes[:, 2, 1] = step[:, 2]
@@ -94,11 +100,11 @@ class SlamProblem(ReadOnlyArrays):
         """Return the same for who has no drift: what it may be is noise of each step."""
         if not len(self.drift_sigma):
             return self
-        slopes = self.drift_slopes(self.steps()) * self.drift_sigma
+        slopes = self.slopes * self.drift_sigma
         more = np.square(slopes).sum(axis=2) / np.square(noise.control)
         scales = np.sqrt(np.square(self.control[:, 3:]) + more)
         control = np.hstack([self.control[:, :3], scales])
-        return replace(self, control=control, drift_sigma=np.zeros(0))
+        return replace(self, control=control, drift_sigma=np.zeros(0), drift_slopes=None)
 
     def dead_reckoned(self) -> Array:
         """Return poses (K, 3) by odometry alone."""
@@ -136,6 +142,7 @@ class SlamProblem(ReadOnlyArrays):
             motion=Increments(),
             control=increments_of(steps, cov),
             keyframe=np.searchsorted(kept, self.keyframe),
+            drift_slopes=np.add.reduceat(onto @ self.slopes, kept[:-1]),
         )
         return short, SlamNoise(np.ones(3), noise.observation), kept
 
@@ -200,6 +207,7 @@ class SlamStatus(Enum):
     CONVERGED = "updates below 1e-2 of their sigmas, weights settled"
     MAX_ITERATIONS = "iteration limit reached: look at the start, or at odometry that jumps"
     DONE = "the whole log was filtered"
+    AMBIGUOUS = "landmarks without names may have been taken for one another: see the notes"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -111,7 +111,7 @@ def linearised(problem: SlamProblem, noise: SlamNoise, values: Values) -> Rows:
     return Rows(
         white @ np.concatenate([to_first, back], axis=2),
         (white @ error[..., None])[..., 0],
-        -white @ problem.drift_slopes(problem.steps())[..., : len(values.drift)],
+        -white @ problem.slopes[..., : len(values.drift)],
         slopes,
         np.where(is_there, own.error, 0.0) * scale,
         is_there.sum(axis=1).astype(np.float64),

@@ -64,6 +64,11 @@ from ssm_graph.systems.landmark_slam.recorded import (
 from ssm_graph.systems.landmark_slam.smoother import SmootherSettings, Values, smooth_landmarks
 
 NO_TRUTH: Final = np.zeros((0, 3))
+PAIRED_ONCE: Final = (
+    "landmarks without names: paired as they came, and not looked at again; the smoother does"
+)
+FAR_SIGMAS: Final = 3.0
+"""By which a path is another one: what a normal error exceeds once in 400 times."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +106,7 @@ class Solved(NamedTuple):
     @property
     def is_good(self) -> bool:
         """Whether it may be trusted as far as its own account goes."""
-        return self.answer.status is not SlamStatus.MAX_ITERATIONS
+        return self.answer.status in (SlamStatus.CONVERGED, SlamStatus.DONE)
 
     def lines(self) -> Iterator[str]:
         """Yield what is said of it."""
@@ -226,7 +231,7 @@ def solve(
     notes: tuple[str, ...] = (),
 ) -> Solved:
     """Return the answer to a log with a truth (K, 3), NaN where there is none, or none at all."""
-    named, errors = problem, None
+    named, errors, elsewhere_m = problem, None, None
     if asked.association is Association.KNOWN:
         unnamed = int(np.sum(problem.landmark == UNKNOWN))
         if unnamed == len(problem.landmark):
@@ -240,10 +245,12 @@ def solve(
         if asked.method == "smoother":
             best = best_opinion(problem, noise, pairing, SmootherSettings(asked.kernel))
             named, first, landmark = best[:3]
+            elsewhere_m = best.elsewhere_m
         else:
             found = associate(problem, noise, pairing)
             named, first = found.problem, Values(found.pose, found.places)
             landmark = found.landmark
+            notes = (*notes, PAIRED_ONCE)
         if np.all(problem.landmark != UNKNOWN):
             errors = association_errors(landmark, problem.landmark)
     sigmas: tuple[SigmaFound, ...] = ()
@@ -264,8 +271,26 @@ def solve(
             named, answer, sigmas, notes = own.problem, own.estimate, own.sigmas, notes + own.notes
         else:
             answer = smooth_landmarks(named, noise, values, settings)
+    if elsewhere_m is not None:
+        answer = _with_doubt(answer, elsewhere_m)
     notes = (*notes, *answer.notes)
     return _solved(asked, named, answer, truth, sigmas=sigmas, errors=errors, notes=notes)
+
+
+def _with_doubt(answer: SlamEstimate, elsewhere_m: Array) -> SlamEstimate:
+    """Return an answer that says where other pairings (K,) put its path, if not where it does."""
+    sigma = np.sqrt(np.linalg.eigvalsh(answer.pose_cov[:, :2, :2])[:, -1])
+    is_off = elsewhere_m > FAR_SIGMAS * sigma
+    if not is_off.any():
+        return answer
+    note = (
+        "landmarks without names: with a little more or less trust in the observations they pair "
+        f"otherwise, and {int(is_off.sum())} of {len(is_off)} poses are up to "
+        f"{elsewhere_m.max():.2f} m elsewhere; sigmas hold for this pairing alone"
+    )
+    settled = answer.status is SlamStatus.CONVERGED
+    status = SlamStatus.AMBIGUOUS if settled else answer.status
+    return replace(answer, status=status, notes=(*answer.notes, note))
 
 
 def _solved(

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from factors.bearing_range import half_turn
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.systems.landmark_slam.association import (
@@ -17,7 +18,8 @@ from ssm_graph.systems.landmark_slam.association import (
 )
 from ssm_graph.systems.landmark_slam.filtered import filtered
 from ssm_graph.systems.landmark_slam.logs import LONGEST_STEP_S, LandmarkLog, problem_of_log
-from ssm_graph.systems.landmark_slam.problem import UNKNOWN, SlamNoise
+from ssm_graph.systems.landmark_slam.models import between, composed
+from ssm_graph.systems.landmark_slam.problem import UNKNOWN, SlamNoise, SlamStatus
 from ssm_graph.systems.landmark_slam.reassociation import reassociate
 from ssm_graph.systems.landmark_slam.solve import Asked, solve
 
@@ -99,6 +101,23 @@ def test_what_odometry_is_wrong_by_becomes_known() -> None:
     assert errors_m[1] < 3.0 * errors_m[0] + 0.1
 
 
+def test_steps_put_together_follow_the_drift_as_they_do_one_by_one() -> None:
+    """Over 50 s in which nothing is seen: a rate of turn bends the way, not its end alone."""
+    log = drive(RING, seen_s=((0.0, 10.0), (60.0, 120.0)))
+    problem = problem_of_log(log)
+    short, _, kept = problem.condensed(log.noise)
+    drift = np.array([0.02, 0.003, 0.001])
+    bent = [problem.start]
+    for step in problem.steps(drift):
+        bent.append(composed(bent[-1], step))
+    wanted = between(np.array(bent)[kept[:-1]], np.array(bent)[kept[1:]])
+    missed = wanted - short.steps(drift)
+    missed[:, 2] = half_turn(missed[:, 2])
+    by_drift = short.steps(drift) - short.steps()
+    assert np.abs(by_drift[:, :2]).max() > 0.1
+    assert np.abs(missed).max() < 0.02
+
+
 def test_after_a_blind_stretch_no_landmark_is_believed_at_once() -> None:
     """What is seen then stands where nothing was mapped, and is not taken for what was."""
     places = np.array([[4.0, 2.5], [1.0, 6.0], [-4.0, 4.0], [-3.0, -0.5]])
@@ -148,6 +167,20 @@ def test_a_filter_goes_through_unnamed_landmarks_that_stand_together() -> None:
     assert np.isfinite(solved.answer.landmarks).all()
 
 
+@pytest.mark.slow
+def test_pairs_that_hang_on_trust_are_told() -> None:
+    """Landmarks too close for ranges that are worse than stated, after blind stretches."""
+    rng = np.random.default_rng(0)
+    places = np.vstack([RING + rng.normal(0.0, 0.25, (5, 2)) for _ in range(3)])
+    log = drive(places, seen_s=((0.0, 25.0), (60.0, 70.0), (105.0, 120.0)), wrong=0.02)
+    seen = log.seen + rng.normal(0.0, 0.15, (len(log.seen), 1)) * [1.0, 0.2]
+    log = replace(log, seen=seen)
+    solved = solve(problem_of_log(log), log.noise, Asked(association=Association.JOINT))
+    assert solved.answer.status is SlamStatus.AMBIGUOUS
+    assert not solved.is_good
+    assert "pair otherwise" in " ".join(solved.notes)
+
+
 def test_a_filter_without_any_landmark_answers() -> None:
     """One sighting makes none: the path is the odometry's."""
     log = drive(RING, seen_s=((0.0, 20.0),))
@@ -182,9 +215,11 @@ def test_unnamed_is_nearly_as_good_as_named() -> None:
     problem = problem_of_log(log)
     true = np.column_stack([np.interp(problem.time_s, log.truth_s, x) for x in log.truth.T])
     named, unnamed = (
-        solve(problem, log.noise, Asked(association=kind), truth=true).score
+        solve(problem, log.noise, Asked(association=kind), truth=true)
         for kind in (Association.KNOWN, Association.JOINT)
     )
-    assert named is not None
-    assert unnamed is not None
-    assert unnamed.aligned_m < 1.2 * named.aligned_m + 0.01
+    assert named.score is not None
+    assert unnamed.score is not None
+    assert unnamed.score.aligned_m < 1.2 * named.score.aligned_m + 0.01
+    assert unnamed.answer.status is SlamStatus.CONVERGED
+    assert unnamed.is_good
