@@ -30,7 +30,7 @@ from ssm_graph.systems.visual_ranges.range_fit import (
 from ssm_graph.systems.visual_ranges.range_terms import Places
 from ssm_graph.systems.visual_ranges.ranges import Indices
 from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, RangeKernel
-from ssm_graph.systems.visual_ranges.widening import widened
+from ssm_graph.systems.visual_ranges.widening import opened, widened, with_open
 
 DIRECTIONS: Final = 12
 SCALES: Final = 4
@@ -363,7 +363,8 @@ def _judged(
         told = ", ".join(f"{one.scale / best.scale:.2f}" for one in others)
         reasons.append(f"other scales fit as well: {told} times this one (gap {gap:.1f})")
     scale_is_sharp = not reasons
-    ready, doubts = _sharp_anchors(problem, names, rules, best, near, gap)
+    wide = with_open(best, opened(problem, best))
+    ready, doubts = _sharp_anchors(problem, names, rules, (best, wide), near, gap)
     reasons += doubts
     against = contradictions(
         problem, names, best, stated_m=stated_m, rms_sigmas=rules.rms_sigmas,
@@ -394,24 +395,25 @@ def _judged(
     told = "" if state is StartState.READY else advice(
         shape, scale=best.scale, name=names[0], weakest=weakest
     )  # fmt: skip
-    return Start(state, best, (*near,), gap, shape, (*reasons, *against), told, (*ready,))
+    return Start(state, wide, (*near,), gap, shape, (*reasons, *against), told, (*ready,))
 
 
 def _sharp_anchors(
     problem: Problem,
     names: tuple[str, ...],
     rules: StartRules,
-    best: Solution,
+    best_and_wide: tuple[Solution, Solution],
     near: list[Solution],
     gap: float,
 ) -> tuple[list[bool], list[str]]:
     """Return which anchors are sharp and without a rival, and what the others lack."""
     at, ready, doubts = problem.places, [], []
+    best, wide = best_and_wide
     for j, name in enumerate(names):
-        sigma = float(np.sqrt(np.trace(best.anchor_covariance(j))))
+        rivals = [one for one in near if moved(best, one, j)]
+        sigma = float(np.sqrt(np.trace((best if rivals else wide).anchor_covariance(j))))
         median = float(np.median(at.range_m[at.anchor == j]))
         limit = max(rules.anchor_sigma_m, rules.anchor_sigma_share * median)
-        rivals = [one for one in near if moved(best, one, j)]
         if sigma > limit:
             doubts.append(f"anchor {name} known to {sigma:.2f} m, {limit:.2f} m are needed")
         elif rivals:

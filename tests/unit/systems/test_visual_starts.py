@@ -364,3 +364,10 @@ def test_real_radios() -> None:
     assert row["anchor_m"][0] < 0.5
     bad = starloc_trial(read_starloc(STARLOC / "loop-2d-fast_s1"), ("7",))
     assert bad["state"] in ("AMBIGUOUS", "REFUSED")
+
+
+@pytest.mark.slow
+def test_an_anchor_near_the_plane_of_the_path_has_a_sigma_that_covers_it() -> None:
+    """Its height acts by its square: 1.6 m off at a straight row's sigma of 0.25 m."""
+    row = walk_trial(("corridor", 60, 1, 0.3, 0.002, 160012))
+    assert 1.0 < row["anchor_m"][0] < 3.0 * row["anchor_sigma_m"][0] < 2.5
