@@ -78,7 +78,7 @@ class StartRules:
     anchor_sigma_share: float = 0.06
     """Of the median range; the larger of both counts."""
     gap: float = 9.0
-    """Deviance by which the next distinct minimum is worse."""
+    """Deviance by which the next distinct minimum is worse, times what a deviance overstates."""
     rms_sigmas: float = 2.0
     """Robust rms of the residuals in stated sigmas."""
     marked_share: float = 0.4
@@ -163,7 +163,7 @@ def find_start(
     best, *rivals = (polished(problem, one) for one in ends)
     apart = [rival for rival in rivals if _is_apart(best, rival)]
     gap = min((rival.cost - best.cost for rival in apart), default=np.inf)
-    near = [rival for rival in apart if rival.cost - best.cost < rules.gap]
+    near = [one for one in apart if one.cost - best.cost < rules.gap * best.understated]
     return _judged(problem, names, rules, best, near, gap, turned_rad, stated_m)
 
 
@@ -443,7 +443,8 @@ def later_anchor(
     kept = [(row, cost) for row, (_, cost) in zip(made, found, strict=True)]
     told = []
     for row, cost in kept:
-        if cost > kept[0][1] + rules.gap:
+        one = solution(problem, row, is_near=True)
+        if cost > kept[0][1] + rules.gap * one.understated:
             break
-        told.append((row[2:], solution(problem, row, is_near=True).covariance[2:, 2:], cost))
+        told.append((row[2:], one.covariance[2:, 2:], cost))
     return told

@@ -45,7 +45,8 @@ def opened(problem: Problem, best: Solution) -> Array:
 
     Near the plane of a path the height of an anchor acts by its square: one sigma from a straight
     row may be a small part of what the ranges leave open. So each anchor is held at places along
-    that direction, and all else is found anew: 3 sigma are where the deviance has risen by 9.
+    that direction, and all else is found anew: 3 sigma are where the deviance has risen by 9, times
+    what it overstates.
     """
     found = np.ones(problem.n_anchors)
     for j in range(problem.n_anchors):
@@ -55,7 +56,7 @@ def opened(problem: Problem, best: Solution) -> Array:
             tried = np.tile(best.unknowns, (len(REACH), 1))
             tried[:, own] += side * np.outer(REACH, np.sqrt(square[-1]) * axes[:, -1])
             held = np.arange(own.start, own.stop)
-            rise = search(problem, tried, held=held).cost - best.cost
+            rise = (search(problem, tried, held=held).cost - best.cost) / best.understated
             over = np.flatnonzero(rise >= SQUARE_OF_3)
             last = int(over[0]) if len(over) else len(REACH)
             if not last:
