@@ -371,3 +371,19 @@ def test_an_anchor_near_the_plane_of_the_path_has_a_sigma_that_covers_it() -> No
     """Its height acts by its square: 1.6 m off at a straight row's sigma of 0.25 m."""
     row = walk_trial(("corridor", 60, 1, 0.3, 0.002, 160012))
     assert 1.0 < row["anchor_m"][0] < 3.0 * row["anchor_sigma_m"][0] < 2.5
+
+
+@pytest.mark.slow
+def test_ranges_that_are_too_long_in_bursts_make_no_place_certain() -> None:
+    """A third of them: a mirror image that is better by a deviance of 9 is not the only place."""
+    run = Run(
+        "corridor", 161000, 63.0, n_anchors=3, texel_m=0.05, ranges=RangeFaults(nlos_share=0.3)
+    )
+    ranging, frames, anchors = true_run(run)
+    until(ranging, frames, 63.0)
+    result = ranging.result()
+    assert abs(np.log(result.scale / UNIT_M)) < 3.0 * result.sigma_log_scale
+    off = np.linalg.norm(np.array([found.place_m for found in result.anchors]) - anchors, axis=1)
+    assert off.max() > 1.0
+    for error, found in zip(off, result.anchors, strict=True):
+        assert error < 3.0 * np.sqrt(np.trace(found.covariance)) or len(found.alternatives_m)
