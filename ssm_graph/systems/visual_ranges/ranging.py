@@ -172,7 +172,10 @@ class Ranging:
         self._tried = self._checked = 0
 
     def restart(self) -> None:
-        """Forget scale and anchors: the map's scale has changed. The next update starts anew."""
+        """Forget scale and anchors: the map's scale has changed. The next update starts anew.
+
+        When they were known first is kept.
+        """
         self.found, self._tried, self._checked = None, 0, 0
         self.anchors = [_Own(own.name) for own in self.anchors]
 
@@ -281,7 +284,8 @@ class Ranging:
             return []
         self._checked = len(places.time_s)
         self.found, self.used = self.start.solution, [int(j) for j in eligible]
-        self.started_s = float(places.time_s[-1])
+        now = float(places.time_s[-1])
+        self.started_s = float(np.fmin(self.started_s, now))
         for i, j in enumerate(self.used):
             is_ready = self.start.anchor_ready[i]
             self._set(
@@ -291,7 +295,7 @@ class Ranging:
                     (one.anchors[i].copy(), float(one.biases[i])) for one in self.start.alternatives
                 ),
             )
-        self._go_on(places, self.started_s)
+        self._go_on(places, now)
         found = self.found
         return [
             f"scale {found.scale:.4g} m a map unit, known to {100 * found.sigma_log_scale:.1f} % "

@@ -195,6 +195,11 @@ def test_a_place_that_is_as_good_is_found_again_at_the_end() -> None:
     assert len(places) == 2
     for z in (1.5, -1.5):
         assert np.linalg.norm(places - [2.0, 1.0, z], axis=1).min() < 0.3
+    ranging.started_s = 12.0
+    ranging.restart()
+    until(ranging, frames, 20.0)
+    assert ranging.has_scale
+    assert ranging.started_s == 12.0
 
 
 def test_all_places_of_an_anchor_judge_a_loop() -> None:
