@@ -273,6 +273,9 @@ class Solution(ReadOnlyArrays):
     """Mean square of the path's modes, what is open of them included: 1 as expected."""
     arm: Array | None = None
     """(3,) coefficients of the lever arm's error; None where it is exact"""
+    understated: float = 1.0
+    """By how much information alone understates the covariance, and a deviance overstates: ranges
+    that are too long in bursts say the same, and a robust kernel has its price."""
 
     @property
     def sigma_log_scale(self) -> float:
@@ -311,10 +314,12 @@ def solution(
     weight = problem.kernel.weight(error, variance, problem.places.sigma_m)
     modes = slice(problem.n_core, problem.n_core + 3 * problem.drift.shape[1])
     square = at[0, modes] ** 2 + covariance.diagonal()[modes]
-    covariance = covariance * problem.kernel.inefficiency(error, problem.places.sigma_m)
-    covariance = covariance * _repeated(problem, weight[0] * error[0])
+    understated = float(problem.kernel.inefficiency(error, problem.places.sigma_m))
+    understated *= _repeated(problem, weight[0] * error[0])
     cost = float(_cost(problem, at, error)[0])
-    found = _outwards(problem, at[0], covariance, (error[0], variance[0], weight[0]), cost)
+    each = (error[0], variance[0], weight[0])
+    found = _outwards(problem, at[0], understated * covariance, each, cost)
+    found = replace(found, understated=understated)
     if problem.places.arm is not None:
         found = replace(found, arm=at[0, -3:].copy())
     return replace(found, drift_square=float(square.mean())) if square.size else found
@@ -383,10 +388,11 @@ def _kept_step(problem: Problem, at: Array, step: Array) -> Array:
 def polished(problem: Problem, found: Solution) -> Solution:
     """Return a minimum with what is far too long taken out of it: see :data:`.weights.POLISH`.
 
-    Its cost stays that of the kernel it was found by, so that minima can be compared.
+    Its cost, and what that overstates, stay those of the kernel it was found by, so that minima can
+    be compared.
     """
     last = solution(replace(problem, kernel=POLISH), found.unknowns, is_near=True, rounds=15)
-    return replace(last, cost=found.cost)
+    return replace(last, cost=found.cost, understated=found.understated)
 
 
 def unknowns_of(

@@ -75,7 +75,8 @@ def against_rivals(
 ) -> tuple[Solution, tuple[tuple[Array, float], ...]]:
     """Return the best solution with anchor ``i`` elsewhere, and its places that are as good.
 
-    ``others`` are places (3,) and biases to be tried, ``gap`` the deviance from which one is worse.
+    ``others`` are places (3,) and biases to be tried, ``gap`` the deviance from which one is worse,
+    but for what it overstates.
     """
     starts = [found.unknowns]
     for place, bias in others:
@@ -92,7 +93,7 @@ def against_rivals(
         place = one[:3] + np.exp(unknowns[0]) * problem.middle
         taken = np.array([found.anchors[i], *(other for other, _ in kept)])
         is_new = float(np.linalg.norm(taken - place, axis=1).min()) > SAME_PLACE_M
-        if is_new and cost < float(fit.cost.min()) + gap:
+        if is_new and cost < float(fit.cost.min()) + gap * found.understated:
             kept.append((place, float(one[3])))
     return found, (*kept,)
 

@@ -49,7 +49,7 @@ from ssm_graph.systems.visual_ranges.start import (
     moved,
 )
 from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, POLISH
-from ssm_graph.systems.visual_ranges.widening import widened
+from ssm_graph.systems.visual_ranges.widening import opened, widened, with_open
 
 __all__ = ["Anchor", "AnchorState", "Ranging", "RangingResult"]
 
@@ -73,6 +73,8 @@ class _Own(NamedTuple):
     """Places (3,) m, and biases."""
     lost_s: float = np.inf
     """From then on its ranges fit no more, and are left out."""
+    times_open: float = 1.0
+    """How many times its sigma its place is open, see :func:`.widening.opened`."""
 
 
 class Ranging:
@@ -170,7 +172,10 @@ class Ranging:
         self._tried = self._checked = 0
 
     def restart(self) -> None:
-        """Forget scale and anchors: the map's scale has changed. The next update starts anew."""
+        """Forget scale and anchors: the map's scale has changed. The next update starts anew.
+
+        When they were known first is kept.
+        """
         self.found, self._tried, self._checked = None, 0, 0
         self.anchors = [_Own(own.name) for own in self.anchors]
 
@@ -216,6 +221,11 @@ class Ranging:
             biases=further.biases + own[:, 3],
             covariance=wider * covariance,
         )
+        self.found = self._as_open(self.found)
+
+    def _as_open(self, found: Solution) -> Solution:
+        """Return a solution whose anchors are as open as they were found to be."""
+        return with_open(found, np.array([self.anchors[j].times_open for j in self.used]))
 
     def result(self) -> RangingResult:
         """Return all as it stands."""
@@ -274,7 +284,8 @@ class Ranging:
             return []
         self._checked = len(places.time_s)
         self.found, self.used = self.start.solution, [int(j) for j in eligible]
-        self.started_s = float(places.time_s[-1])
+        now = float(places.time_s[-1])
+        self.started_s = float(np.fmin(self.started_s, now))
         for i, j in enumerate(self.used):
             is_ready = self.start.anchor_ready[i]
             self._set(
@@ -284,7 +295,7 @@ class Ranging:
                     (one.anchors[i].copy(), float(one.biases[i])) for one in self.start.alternatives
                 ),
             )
-        self._go_on(places, self.started_s)
+        self._go_on(places, now)
         found = self.found
         return [
             f"scale {found.scale:.4g} m a map unit, known to {100 * found.sigma_log_scale:.1f} % "
@@ -321,6 +332,10 @@ class Ranging:
             may_refuse, self._checked = self._checked > 0, len(places.time_s)
             told = self._check(own, problem, may_refuse=may_refuse)
             self._rivals(problem)
+        if self._checked == len(places.time_s):
+            for j, times in zip(self.used, opened(problem, self.found), strict=True):
+                self._set(j, times_open=float(times))
+        self.found = self._as_open(self.found)
         assert self.terms is not None
         row = self.terms.row[kept]
         self.error[row], self.weight[row] = plain_errors(everything, self.found)

@@ -84,7 +84,7 @@ class RangingResult(ReadOnlyArrays):
     """Why scale or anchors are not ready."""
     advice: str
     started_s: float
-    """Time at which the scale was ready; NaN before."""
+    """Time at which there was a scale for the first time; NaN before."""
     vehicle: VehicleResult | None = None
     """None where it told no scale."""
     lever_error_m: Array = field(default_factory=lambda: np.zeros(3))

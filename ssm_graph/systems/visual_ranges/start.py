@@ -30,7 +30,7 @@ from ssm_graph.systems.visual_ranges.range_fit import (
 from ssm_graph.systems.visual_ranges.range_terms import Places
 from ssm_graph.systems.visual_ranges.ranges import Indices
 from ssm_graph.systems.visual_ranges.weights import NLOS_WEIGHT, RangeKernel
-from ssm_graph.systems.visual_ranges.widening import widened
+from ssm_graph.systems.visual_ranges.widening import opened, widened, with_open
 
 DIRECTIONS: Final = 12
 SCALES: Final = 4
@@ -78,7 +78,7 @@ class StartRules:
     anchor_sigma_share: float = 0.06
     """Of the median range; the larger of both counts."""
     gap: float = 9.0
-    """Deviance by which the next distinct minimum is worse."""
+    """Deviance by which the next distinct minimum is worse, times what a deviance overstates."""
     rms_sigmas: float = 2.0
     """Robust rms of the residuals in stated sigmas."""
     marked_share: float = 0.4
@@ -163,7 +163,7 @@ def find_start(
     best, *rivals = (polished(problem, one) for one in ends)
     apart = [rival for rival in rivals if _is_apart(best, rival)]
     gap = min((rival.cost - best.cost for rival in apart), default=np.inf)
-    near = [rival for rival in apart if rival.cost - best.cost < rules.gap]
+    near = [one for one in apart if one.cost - best.cost < rules.gap * best.understated]
     return _judged(problem, names, rules, best, near, gap, turned_rad, stated_m)
 
 
@@ -363,7 +363,8 @@ def _judged(
         told = ", ".join(f"{one.scale / best.scale:.2f}" for one in others)
         reasons.append(f"other scales fit as well: {told} times this one (gap {gap:.1f})")
     scale_is_sharp = not reasons
-    ready, doubts = _sharp_anchors(problem, names, rules, best, near, gap)
+    wide = with_open(best, opened(problem, best))
+    ready, doubts = _sharp_anchors(problem, names, rules, (best, wide), near, gap)
     reasons += doubts
     against = contradictions(
         problem, names, best, stated_m=stated_m, rms_sigmas=rules.rms_sigmas,
@@ -394,24 +395,25 @@ def _judged(
     told = "" if state is StartState.READY else advice(
         shape, scale=best.scale, name=names[0], weakest=weakest
     )  # fmt: skip
-    return Start(state, best, (*near,), gap, shape, (*reasons, *against), told, (*ready,))
+    return Start(state, wide, (*near,), gap, shape, (*reasons, *against), told, (*ready,))
 
 
 def _sharp_anchors(
     problem: Problem,
     names: tuple[str, ...],
     rules: StartRules,
-    best: Solution,
+    best_and_wide: tuple[Solution, Solution],
     near: list[Solution],
     gap: float,
 ) -> tuple[list[bool], list[str]]:
     """Return which anchors are sharp and without a rival, and what the others lack."""
     at, ready, doubts = problem.places, [], []
+    best, wide = best_and_wide
     for j, name in enumerate(names):
-        sigma = float(np.sqrt(np.trace(best.anchor_covariance(j))))
+        rivals = [one for one in near if moved(best, one, j)]
+        sigma = float(np.sqrt(np.trace((best if rivals else wide).anchor_covariance(j))))
         median = float(np.median(at.range_m[at.anchor == j]))
         limit = max(rules.anchor_sigma_m, rules.anchor_sigma_share * median)
-        rivals = [one for one in near if moved(best, one, j)]
         if sigma > limit:
             doubts.append(f"anchor {name} known to {sigma:.2f} m, {limit:.2f} m are needed")
         elif rivals:
@@ -441,7 +443,8 @@ def later_anchor(
     kept = [(row, cost) for row, (_, cost) in zip(made, found, strict=True)]
     told = []
     for row, cost in kept:
-        if cost > kept[0][1] + rules.gap:
+        one = solution(problem, row, is_near=True)
+        if cost > kept[0][1] + rules.gap * one.understated:
             break
-        told.append((row[2:], solution(problem, row, is_near=True).covariance[2:, 2:], cost))
+        told.append((row[2:], one.covariance[2:, 2:], cost))
     return told
