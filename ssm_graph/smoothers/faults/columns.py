@@ -105,7 +105,7 @@ def spike_weights(whitened: Array) -> Array:
         counted = np.stack([weights * square, weights * dim])
         within = uniform_filter1d(counted, NOISE_OVER, axis=1)
         here = np.maximum(within[0] / np.maximum(within[1], 1.0 / NOISE_OVER), 1.0)
-        usual = np.median(here)
+        usual = np.median(here) if len(here) else 1.0
         is_usual = np.abs(np.log(here / usual)) < 2.0 * np.log(OTHER_NOISE)
         excess = np.where(is_usual, usual, here)
     return np.asarray(weights / excess)
