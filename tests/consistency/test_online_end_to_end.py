@@ -156,7 +156,7 @@ def test_sigterm_ends_in_order_and_the_run_goes_on_later(mission: Path, tmp_path
     words = ("--replay", mission, "--out", run)
     with (
         killed_at_last(
-            start(*words, "--speed", "20", "--publish", f"tcp-listen://:{port}")
+            start(*words, "--speed", "6", "--publish", f"tcp-listen://:{port}")
         ) as process,
         connected(port) as client,
         client.makefile("rb") as lines,
