@@ -6,9 +6,9 @@ landmark for long, so that it closes nothing, and what is met again stands in th
 with the whole log smoothed, scans are paired anew along the path (`reassociation`), and landmarks
 that may be one by their joint covariance are taken as one (`merging`), where that costs less: where
 it bends the odometry less and explains more, with fewer landmarks. All opinions have one noise, so
-that their costs compare. Of the cheapest the map is then made simpler, and stretches are tied to
-the rest anew, where that gains more than chance does (`is_better`). Where the others put the path
-tells whether it is sure.
+that their costs compare. Of the cheapest, and of those that cannot be told from it, the map is then
+made simpler, and stretches are tied to the rest anew, where that gains more than chance does
+(`is_better`). Where the others put the path tells whether it is sure.
 """
 
 from __future__ import annotations
@@ -115,7 +115,11 @@ def best_opinion(
         judge.begun(first.landmark, Values(first.pose[kept], first.places), is_open)
         for first, is_open in firsts
     ]
-    best = judge.improved(min(found, key=lambda one: one.cost))
+    cheapest = min(found, key=lambda one: one.cost)
+    for number, one in enumerate(found):
+        if one.cost - cheapest.cost <= SURE * _noise(one, cheapest):
+            found[number] = judge.improved(one)
+    best = min(found, key=lambda one: one.cost)
     pose = problem.expanded(best.values.pose, kept)
     apart = [problem.expanded(one.values.pose, kept) - pose for one in found]
     return best._replace(

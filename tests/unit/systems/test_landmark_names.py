@@ -14,6 +14,7 @@ from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.systems.landmark_slam.association import (
     Association,
+    AssociationSettings,
     associate,
     association_errors,
 )
@@ -168,6 +169,19 @@ def test_after_a_blind_stretch_no_landmark_is_believed_at_once() -> None:
     old = np.unique(found.landmark[(log.seen_s < 20.0) & (found.landmark != UNKNOWN)])
     taken = np.isin(found.landmark[is_new], old)
     assert not taken.any()
+
+
+def test_a_short_memory_closes_nothing() -> None:
+    """What is met again after a blind stretch is another landmark, and the same one otherwise."""
+    log = drive(RING, seen_s=((0.0, 25.0), (45.0, 70.0)))
+    problem = problem_of_log(log)
+    for memory_s, is_met in ((10.0, False), (np.inf, True)):
+        found = associate(problem, log.noise, AssociationSettings(memory_s=memory_s)).landmark
+        is_early, known = log.seen_s < 35.0, found != UNKNOWN
+        before, after = np.unique(found[known & is_early]), np.unique(found[known & ~is_early])
+        assert len(before) > 2
+        assert len(after) > 2
+        assert bool(np.isin(after, before).any()) is is_met
 
 
 def test_leftovers_become_landmarks() -> None:
