@@ -218,7 +218,7 @@ class _Judge:
         of_blocks = np.bincount(block[self._problem.keyframe], missed(squares), block[-1] + 1)
         of_blocks += np.bincount(block[1:], odometry, block[-1] + 1)
         of_blocks[0] += np.sum(np.square(found.values.drift / self._problem.drift_sigma))
-        return of_blocks
+        return np.asarray(of_blocks, dtype=np.float64)
 
     def _paired(self, opinion: Opinion, is_open: bool) -> Opinion:
         """Return an opinion with its scans paired anew for as long as that costs less."""
