@@ -68,6 +68,9 @@ class AssociationSettings:
     """... or nearer than this share of the range."""
     provisional_s: float = 5.0
     """After which one that was not seen again is forgotten."""
+    memory_s: float = np.inf
+    """Landmarks that were not seen for longer are no candidates: whether they are met again is for
+    who knows the whole log."""
     near_m: float = 20.0
     """Landmarks farther from where an observation would put its own are no candidates."""
 
@@ -106,17 +109,22 @@ def associate(
     pose = np.empty((len(problem.time_s), 3))
     waiting: list[_Provisional] = []
     first = problem.first_of.tolist()
+    last_s: list[float] = []
     for k in range(len(pose)):
         if k > 0:
             move(k)
         rows = np.arange(first[k], first[k + 1])
         rows = rows[np.isfinite(problem.measured[rows]).all(axis=1)]
         if len(rows):
-            pairs, fresh = _paired(slam, problem, rows, how)
+            is_near = problem.time_s[k] - np.array(last_s) < how.memory_s
+            pairs, fresh = _paired(slam, problem, rows, is_near, how)
             for row, name in pairs:
                 found[row] = name
             joined = _sighted(waiting, slam, problem, fresh, found, k, how)
             _update(slam, problem, [*pairs, *joined])
+            last_s += [0.0] * len(joined)
+            for _, name in (*pairs, *joined):
+                last_s[name] = problem.time_s[k]
         pose[k] = slam.pose[0]
     names = tuple(str(i) for i in slam.ids)
     return Associated(problem.associated(found, names), found, pose, slam.landmarks()[0])
@@ -137,14 +145,18 @@ def _places(slam: MapFilter, measured: Array) -> Array:
 
 
 def _paired(
-    slam: MapFilter, problem: SlamProblem, rows: NDArray[np.intp], how: AssociationSettings
+    slam: MapFilter,
+    problem: SlamProblem,
+    rows: NDArray[np.intp],
+    may: NDArray[np.bool_],
+    how: AssociationSettings,
 ) -> tuple[list[tuple[int, int]], list[int]]:
-    """Return pairs of rows and landmarks, and the rows that are of a new one."""
+    """Return pairs of rows and landmarks that ``may`` (L,) be met, and rows of a new one."""
     z = problem.measured[rows]
     if not slam.ids:
         return [], rows.tolist()
     away = np.linalg.norm(_places(slam, z)[:, None] - slam.landmarks()[0], axis=2)
-    near = np.flatnonzero(away.min(axis=0) < how.near_m)
+    near = np.flatnonzero(may & (away.min(axis=0) < how.near_m))
     if len(near) == 0:
         return [], rows.tolist()
     names = [slam.ids[i] for i in near]
@@ -157,7 +169,7 @@ def _paired(
     own = np.stack([inner[0, 2 * i : 2 * i + 2, 2 * i : 2 * i + 2] for i in range(len(near))])
     S = own[None] + R[:, None]
     nis = np.einsum("mli,mli->ml", nu, np.linalg.solve(S, nu[..., None])[..., 0])
-    per_m2 = _density(slam.landmarks()[0])
+    per_m2 = density(slam.landmarks()[0])
     best_odds = -0.5 * np.log(np.linalg.det(2.0 * np.pi * S)) - np.log(per_m2 * z[:, :1])
     near_it = nis < chi2.ppf(how.is_new, 2)
     is_new = ~np.any(near_it & (best_odds > how.tells), axis=1)
@@ -171,7 +183,7 @@ def _paired(
     return [(int(rows[i]), names[j]) for i, j in chosen], rows[is_new].tolist()
 
 
-def _density(places: Array) -> float:
+def density(places: Array) -> float:
     """Return landmarks per m^2 in the box of those that there are, with a margin."""
     extent = np.prod(np.ptp(places, axis=0) + MARGIN_M)
     return float(max(len(places), FEWEST_DENSE) / max(extent, SMALLEST_M2))

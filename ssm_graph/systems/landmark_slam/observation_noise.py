@@ -75,7 +75,7 @@ class _Law(NamedTuple):
     @property
     def wider(self) -> Array:
         """(2,) by which they are multiplied."""
-        return np.asarray(np.sqrt((1.0 + self.alike) / (1.0 - self.alike)))
+        return widened(self.alike)
 
 
 class ObservationsFound(NamedTuple):
@@ -99,7 +99,7 @@ def learn_observations(
     given = stated.observation * problem.scales
     there = np.isfinite(problem.measured)
     ranges = np.where(there[:, 0], problem.measured[:, 0], 0.0)
-    pairs = _successive(problem)
+    pairs = successive(problem)
     now, noise, before = problem, stated, given
     law: _Law | None = None
     estimate = smooth_landmarks(now, noise, first, how)
@@ -130,7 +130,7 @@ def _with_sigmas(
     return replace(problem, observation_scale=scale), SlamNoise(stated.control, rms)
 
 
-def _successive(problem: SlamProblem) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def successive(problem: SlamProblem) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return rows of sightings, each with the next one of the same landmark."""
     order = np.lexsort((problem.keyframe, problem.landmark))
     a, b = order[:-1], order[1:]
@@ -166,14 +166,32 @@ def _law(
             bearing = float(np.sqrt(np.average(squares[at, 1] / share[at], weights=w[at])))
         law = _Law(near, part, bearing, np.zeros(2))
         own = law.sigmas(ranges)
-    z = np.clip(found.rows.own_error * used / own, -FAR, FAR)
-    alike = np.zeros(2)
+    return law._replace(alike=correlations(found.rows.own_error * used / own, there, pairs))
+
+
+def correlations(
+    errors: Array, there: NDArray[np.bool_], pairs: tuple[NDArray[np.intp], NDArray[np.intp]]
+) -> Array:
+    """Return how alike successive errors of range and bearing are, (2,) of 0 to `MOST_ALIKE`.
+
+    Parameters
+    ----------
+    errors : (M, 2) in sigmas.
+    there : (M, 2) whether measured.
+    pairs : of `successive`.
+    """
+    z, alike = np.clip(errors, -FAR, FAR), np.zeros(2)
     for i in range(2):
         a, b = (side[there[pairs[0], i] & there[pairs[1], i]] for side in pairs)
         if len(a) >= FEWEST:
             c = float(np.mean(z[a, i] * z[b, i])) / max(float(np.mean(z[a, i] ** 2)), 1e-300)
             alike[i] = min(c, MOST_ALIKE) if c > 2.0 / np.sqrt(len(a)) else 0.0
-    return law._replace(alike=alike)
+    return alike
+
+
+def widened(alike: Array) -> Array:
+    """Return by what sigmas are multiplied where successive errors are alike, (2,)."""
+    return np.asarray(np.sqrt((1.0 + alike) / (1.0 - alike)))
 
 
 def _growing(squares: Array, ranges: Array, weights: Array) -> tuple[float, float]:

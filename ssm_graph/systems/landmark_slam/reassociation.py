@@ -27,6 +27,9 @@ FEWEST: Final = 5
 """Observations that make a heap a landmark."""
 FEWEST_LEFT: Final = 3
 """Observations with which a landmark stays."""
+MEMORY_S: Final = 10.0
+"""In which odometry of 0.04 rad/sqrt(s) loses 0.13 rad, half a metre at four: less than landmarks
+of different groups are apart."""
 MOST_NEW: Final = 400
 """Landmarks that heaps may add."""
 
@@ -38,11 +41,15 @@ class Reassociated(NamedTuple):
     """(M,) `UNKNOWN` of those left out."""
     places: Array
     """(L, 2) where the landmarks are, about."""
-    squares: Array
-    """(M,) by which each misses its landmark, in its sigmas; `FITS` of those left out."""
 
 
-def reassociate(problem: SlamProblem, sigma: Array, pose: Array, places: Array) -> Reassociated:
+def reassociate(
+    problem: SlamProblem,
+    sigma: Array,
+    pose: Array,
+    places: Array,
+    before: NDArray[np.intp] | None = None,
+) -> Reassociated:
     """Return landmarks anew.
 
     Parameters
@@ -51,12 +58,18 @@ def reassociate(problem: SlamProblem, sigma: Array, pose: Array, places: Array) 
     sigma : (M, 2) of each observation, m and rad.
     pose : (K, 3) smoothed.
     places : (L, 2) of the landmarks so far.
+    before : (M,) landmarks so far: they are met only within `MEMORY_S` of a sighting, as is a heap
+        of itself. None: the path is right enough for all of it to be met at any time.
     """
     seen = _Seen(problem, sigma, pose)
     cost = seen.squares(places)
+    if before is not None:
+        for one in range(len(places)):
+            cost[~seen.is_within(np.flatnonzero(before == one)), one] = np.inf
     found = np.full(len(problem.keyframe), UNKNOWN, dtype=np.intp)
     seen.pair(np.unique(problem.keyframe[seen.rows]), cost, found)
-    of, to = seen.heaps(seen.rows[found[seen.rows] == UNKNOWN])
+    lasts_s = np.inf if before is None else MEMORY_S
+    of, to = seen.heaps(seen.rows[found[seen.rows] == UNKNOWN], lasts_s)
     for _ in range(MOST_NEW):
         is_left = found == UNKNOWN
         both = is_left[of] & is_left[to]
@@ -64,18 +77,56 @@ def reassociate(problem: SlamProblem, sigma: Array, pose: Array, places: Array) 
         size = np.bincount(to, minlength=len(found))
         if size.max(initial=0) < FEWEST:
             break
-        place = seen.place[of[to == np.argmax(size)]].mean(axis=0)
+        heap = of[to == np.argmax(size)]
+        place = seen.place[heap].mean(axis=0)
         places = np.vstack([places, place])
         cost = np.column_stack([cost, seen.squares(place[None])])
+        if before is not None:
+            cost[~seen.is_within(heap), -1] = np.inf
         touched = problem.keyframe[seen.rows[cost[seen.rows, -1] < FITS]]
         seen.pair(np.unique(touched), cost, found)
         if not np.any(found == len(places) - 1):
             break  # all of its heap went to others: the next one would be the same
+    _thinned(cost, found, problem.keyframe)
     stays = np.bincount(found[found >= 0], minlength=len(places)) >= FEWEST_LEFT
     number = np.where(stays, np.cumsum(stays) - 1, UNKNOWN)
-    squares = np.where(found >= 0, cost[np.arange(len(found)), found], FITS)
     landmark = np.where(found >= 0, number[found], UNKNOWN)
-    return Reassociated(landmark, places[stays], np.where(landmark >= 0, squares, FITS))
+    return Reassociated(landmark, places[stays])
+
+
+def missed(squares: Array) -> Array:
+    """Return twice the negative logarithm of likelihoods: Student's, two degrees of freedom."""
+    return np.asarray(4.0 * np.log1p(0.5 * np.minimum(squares, FITS)))
+
+
+def price(n: int) -> float:
+    """Return that of a landmark of a log of n observations: two numbers (Schwarz's criterion)."""
+    return 2.0 * float(np.log(max(n, 2)))
+
+
+def _thinned(cost: Array, found: NDArray[np.intp], keyframe: NDArray[np.intp]) -> None:
+    """Take out landmarks whose observations are as well of others: of less worth than a price."""
+    n, L = len(found), cost.shape[1]
+    taken = np.zeros((int(keyframe.max(initial=0)) + 1, L), dtype=bool)
+    named = found >= 0
+    taken[keyframe[named], found[named]] = True
+    while True:
+        best, best_gain = -1, 0.0
+        for one in np.unique(found[found >= 0]).tolist():
+            rows = np.flatnonzero(found == one)
+            others = np.where(taken[keyframe[rows]], np.inf, cost[rows]).min(axis=1)
+            gain = price(n) - float((missed(others) - missed(cost[rows, one])).sum())
+            if gain > best_gain:
+                best, best_gain = one, gain
+        if best < 0:
+            return
+        rows = np.flatnonzero(found == best)
+        cost[:, best] = np.inf
+        others = np.where(taken[keyframe[rows]], np.inf, cost[rows])
+        found[rows] = np.where(others.min(axis=1) < FITS, others.argmin(axis=1), UNKNOWN)
+        taken[keyframe[rows], best] = False
+        moved = rows[found[rows] >= 0]
+        taken[keyframe[moved], found[moved]] = True
 
 
 class _Seen:
@@ -83,6 +134,7 @@ class _Seen:
 
     def __init__(self, problem: SlamProblem, sigma: Array, pose: Array) -> None:
         self._first = problem.first_of
+        self._time_s = problem.time_s[problem.keyframe]
         self.rows = np.flatnonzero(np.isfinite(problem.measured).all(axis=1))
         at, z = pose[problem.keyframe], problem.measured
         angle = at[:, 2] + z[:, 1]
@@ -93,15 +145,29 @@ class _Seen:
             [along / sigma[:, :1], across / (z[:, :1] * sigma[:, 1:])], axis=1
         )  # (M, 2, 2)
 
+    def is_within(self, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Return which observations (M,) are within `MEMORY_S` of one of some."""
+        if not len(rows):
+            return np.zeros(len(self._time_s), dtype=bool)
+        t = np.sort(self._time_s[rows])
+        after = np.minimum(np.searchsorted(t, self._time_s), len(t) - 1)
+        apart = np.minimum(
+            np.abs(t[after] - self._time_s), np.abs(t[np.maximum(after - 1, 0)] - self._time_s)
+        )
+        return np.asarray(apart < MEMORY_S)
+
     def squares(self, places: Array) -> Array:
         """Return how far (M, L) observations are from places, in squares of their sigmas."""
         off = self.place[:, None] - places
         return np.asarray(np.square(np.einsum("mij,mlj->mli", self._axes, off)).sum(axis=2))
 
-    def heaps(self, rows: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def heaps(
+        self, rows: NDArray[np.intp], lasts_s: float
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return the pairs (P,), (P,) of some observations where the second is near the first.
 
-        Near by the sigmas of the first; only those that a tree finds near in metres are compared.
+        Near by the sigmas of the first, and in ``lasts_s``; only those that a tree finds near in
+        metres are compared.
         """
         if not len(rows):
             return rows, rows
@@ -111,6 +177,7 @@ class _Seen:
         to = rows[np.concatenate(near).astype(np.intp)]
         off = np.einsum("pij,pj->pi", self._axes[of], self.place[of] - self.place[to])
         is_near = np.square(off).sum(axis=1) < IN_A_HEAP
+        is_near &= np.abs(self._time_s[of] - self._time_s[to]) < lasts_s
         return of[is_near], to[is_near]
 
     def pair(self, keyframes: NDArray[np.intp], cost: Array, found: NDArray[np.intp]) -> None:

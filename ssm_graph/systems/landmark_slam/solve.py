@@ -284,8 +284,8 @@ def _with_doubt(answer: SlamEstimate, elsewhere_m: Array) -> SlamEstimate:
     if not is_off.any():
         return answer
     note = (
-        "landmarks without names: with a little more or less trust in the observations they pair "
-        f"otherwise, and {int(is_off.sum())} of {len(is_off)} poses are up to "
+        "landmarks without names: with more or less trust in what was seen, or a shorter memory, "
+        f"they pair otherwise, and {int(is_off.sum())} of {len(is_off)} poses are up to "
         f"{elsewhere_m.max():.2f} m elsewhere; sigmas hold for this pairing alone"
     )
     settled = answer.status is SlamStatus.CONVERGED

@@ -9,19 +9,24 @@ import numpy as np
 import pytest
 
 from factors.bearing_range import half_turn
+from factors.similarity import GaussianKernel
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
 from ssm_graph.systems.landmark_slam.association import (
     Association,
+    AssociationSettings,
     associate,
     association_errors,
 )
-from ssm_graph.systems.landmark_slam.filtered import filtered
+from ssm_graph.systems.landmark_slam.filtered import filtered, first_values
 from ssm_graph.systems.landmark_slam.logs import LONGEST_STEP_S, LandmarkLog, problem_of_log
+from ssm_graph.systems.landmark_slam.merging import Map, all_merged
 from ssm_graph.systems.landmark_slam.models import between, composed
 from ssm_graph.systems.landmark_slam.problem import UNKNOWN, SlamNoise, SlamStatus
 from ssm_graph.systems.landmark_slam.reassociation import reassociate
+from ssm_graph.systems.landmark_slam.smoother import SmootherSettings, smooth_landmarks
 from ssm_graph.systems.landmark_slam.solve import Asked, solve
+from ssm_graph.systems.landmark_slam.sparse import smooth_quickly
 
 STEP_S = 0.1
 SIGMA = np.array([0.05, 0.01])
@@ -118,6 +123,38 @@ def test_steps_put_together_follow_the_drift_as_they_do_one_by_one() -> None:
     assert np.abs(missed).max() < 0.02
 
 
+def test_the_quick_solution_is_the_smoothers() -> None:
+    """Path, map and joint covariance, least squares."""
+    log = drive(RING, seen_s=((0.0, 40.0),))
+    problem = problem_of_log(log)
+    settings = SmootherSettings(GaussianKernel())
+    first = first_values(problem, log.noise)
+    exact = smooth_landmarks(problem, log.noise, first, settings)
+    quick = smooth_quickly(problem, log.noise, first, settings)
+    assert quick.values.pose == pytest.approx(exact.pose, abs=2e-3)
+    assert quick.values.landmarks == pytest.approx(exact.landmarks, abs=2e-3)
+    blocks = quick.cov.reshape(5, 2, 5, 2)[np.arange(5), :, np.arange(5)]
+    assert blocks == pytest.approx(exact.landmark_cov, rel=0.02, abs=1e-6)
+
+
+def test_a_constellation_met_again_is_one() -> None:
+    """Off by a turn and a shift that the joint covariance allows; a lone landmark is not taken."""
+    rng = np.random.default_rng(0)
+    lone = np.array([[12.0, 9.0]])
+    places = np.vstack([RING, RING, lone])
+    moves = np.zeros((22, 3))  # shift and turn of all that was met later
+    moves[10::2, 0] = moves[11::2, 1] = 1.0
+    moves[10::2, 2], moves[11::2, 2] = -places[5:, 1], places[5:, 0]
+    off = moves @ [0.8, -0.5, 0.15] + 0.02 * rng.standard_normal(22)
+    cov = moves @ np.diag([1.0, 1.0, 0.04]) @ moves.T + 0.03**2 * np.eye(22)
+    together = np.zeros((11, 11), dtype=np.intp)
+    together[:5, :5] = together[5:, 5:] = 20
+    now = Map(places + off.reshape(-1, 2), cov, together, np.arange(11))
+    one = all_merged(now, 0.1, 5.0).one
+    assert one.tolist() == [0, 1, 2, 3, 4, 0, 1, 2, 3, 4, 10]
+    assert all_merged(now._replace(cov=1e-6 * cov), 0.1, 5.0).one.tolist() == list(range(11))
+
+
 def test_after_a_blind_stretch_no_landmark_is_believed_at_once() -> None:
     """What is seen then stands where nothing was mapped, and is not taken for what was."""
     places = np.array([[4.0, 2.5], [1.0, 6.0], [-4.0, 4.0], [-3.0, -0.5]])
@@ -134,14 +171,27 @@ def test_after_a_blind_stretch_no_landmark_is_believed_at_once() -> None:
     assert not taken.any()
 
 
+def test_a_short_memory_closes_nothing() -> None:
+    """What is met again after a blind stretch is another landmark, and the same one otherwise."""
+    log = drive(RING, seen_s=((0.0, 25.0), (45.0, 70.0)))
+    problem = problem_of_log(log)
+    for memory_s, is_met in ((10.0, False), (np.inf, True)):
+        found = associate(problem, log.noise, AssociationSettings(memory_s=memory_s)).landmark
+        is_early, known = log.seen_s < 35.0, found != UNKNOWN
+        before, after = np.unique(found[known & is_early]), np.unique(found[known & ~is_early])
+        assert len(before) > 2
+        assert len(after) > 2
+        assert bool(np.isin(after, before).any()) is is_met
+
+
 def test_leftovers_become_landmarks() -> None:
-    """A first opinion that has one landmark in the place of two, and none in that of a third."""
+    """A first opinion that has one in the place of two, none in that of a third, one twice."""
     pair = np.vstack([RING, RING[0] + [0.3, 0.3]])
     log = drive(pair, seen_s=((0.0, 120.0),))
     problem = problem_of_log(log)
     true = np.column_stack([np.interp(problem.time_s, log.truth_s, x) for x in log.truth.T])
     sigma = log.noise.observation * problem.scales
-    first = np.delete(pair, [3, 5], axis=0)
+    first = np.vstack([np.delete(pair, [3, 5], axis=0), RING[1] + 0.003])
     again = reassociate(problem, sigma, true, first)
     errors = association_errors(again.landmark, problem.landmark)
     assert len(again.places) == len(pair)
