@@ -56,8 +56,17 @@ class Evidence(NamedTuple):
 
     def freed(self, combined: Array, prior: Array) -> Evidence:
         """Return the same once ``combined`` (C, m), sums of columns, may be of any size."""
-        crossed = combined.T @ self.information
-        return self.without(combined.T @ self.score, crossed, crossed @ combined + prior)
+        used, columns = _used(combined)
+        crossed = columns.T @ self.information[used]
+        return self.without(
+            columns.T @ self.score[used], crossed, crossed[:, used] @ columns + prior
+        )
+
+    def sizes(self, combined: Array, prior: Array) -> Array:
+        """Return how large (m,) ``combined`` (C, m), sums of columns, are."""
+        used, columns = _used(combined)
+        inner = columns.T @ self.information[np.ix_(used, used)] @ columns + prior
+        return np.linalg.solve(inner, columns.T @ self.score[used])
 
 
 class OwnRows(NamedTuple):
@@ -250,6 +259,12 @@ class ChainEvidence:
         place = np.argsort(order)
         flat = [history[place[i], : length[i]].reshape(-1, size) for i in range(len(length))]
         return flat, [onward[place[i]] for i in range(len(length))]
+
+
+def _used(combined: Array) -> tuple[NDArray[np.intp], Array]:
+    """Return which columns sums (C, m) are made of, few of many, and by how much of each."""
+    used = np.flatnonzero(combined.any(axis=1))
+    return used, combined[used]
 
 
 def _mirror_lower(square: Array) -> None:

@@ -18,8 +18,8 @@ from ssm_graph.graph.first_values import first_values
 from ssm_graph.graph.freed import FAULTS, Freed, OfArray, array_columns
 from ssm_graph.graph.linearize import GraphLinearizer
 from ssm_graph.mission.estimate import Estimate, Status
-from ssm_graph.mission.fault import Treatment
-from ssm_graph.mission.mission import NO_AIDS
+from ssm_graph.mission.fault import DetectedFault, Treatment
+from ssm_graph.mission.mission import NO_AIDS, Mission
 from ssm_graph.mission.problem import build_problem
 from ssm_graph.sensors.dvl import DvlLog
 from ssm_graph.simulation import (
@@ -52,6 +52,7 @@ from ssm_graph.smoothers.faults.hypotheses import Course, Hypothesis
 from ssm_graph.smoothers.faults.judged import Judged
 from ssm_graph.smoothers.faults.search import FaultSearch
 from ssm_graph.smoothers.faults.windows import Readings, disagreeing
+from ssm_graph.smoothers.mission import smooth
 from tests.aids_fixture import with_every_aid
 from tests.helpers import simulated, with_initial
 
@@ -415,16 +416,34 @@ def test_chi_square_of_every_stretch(course: Course) -> None:
             assert table[begin, end] == pytest.approx(noise @ own @ fitted, rel=2e-2)
 
 
-def test_what_the_last_look_changes_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_the_last_look_changes_is_said() -> None:
     """One look that finds something has not settled."""
-    monkeypatch.setattr("ssm_graph.smoothers.faults.watch.MOST_LOOKS", 1)
-    sim = simulated(duration_s=120.0, dvl=QUIET, seed=3)
-    fault = Fault(sensor=Sensor.DEPTH, start_s=40.0, end_s=90.0, size=0.5)
-    broken = with_faults(sim.mission, (fault,), truth=sim.truth_at)
-    estimate = smoothed(replace(sim, mission=broken.mission))
+    sim, mission = _depth_off()
+    estimate = smoothed(
+        replace(sim, mission=mission), SmootherConfig(fault_search=FaultSearch(most_looks=1))
+    )
     assert estimate.status is Status.SUSPECT
     assert [one.treatment for one in estimate.faults] == [Treatment.CHANGING]
     assert estimate.reason.startswith("depth, ")
+
+
+def test_a_unit_that_is_wrong_leaves_few_looks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No stretch explains it; a clock is taken off like others."""
+    unit = DetectedFault("gyros", "reads 0.60 of the turn", 0.0, 120.0, 99.0, 1, Treatment.SAID)
+    monkeypatch.setattr("ssm_graph.smoothers.mission.MOST_LOOKS", 1)
+    ended = {}
+    for suspect in (unit, replace(unit, what="late", late_s=0.1)):
+        monkeypatch.setattr("ssm_graph.smoothers.mission.find_suspects", lambda _, s=suspect: (s,))
+        estimate = smooth(_depth_off()[1])
+        ended[suspect.what] = [one.treatment for one in estimate.faults if one.sensor == "depth"]
+    assert ended[unit.what] == [Treatment.CHANGING]
+    assert ended["late"] == [Treatment.FREED]
+
+
+def _depth_off() -> tuple[SimulatedMission, Mission]:
+    sim = simulated(duration_s=120.0, dvl=QUIET, seed=3)
+    fault = Fault(sensor=Sensor.DEPTH, start_s=40.0, end_s=90.0, size=0.5)
+    return sim, with_faults(sim.mission, (fault,), truth=sim.truth_at).mission
 
 
 def test_beams_without_a_speed_are_compared_with_none() -> None:

@@ -136,11 +136,10 @@ class Judge:
     def _of_nuisances(self, grid: Grid, faults: Sequence[Fault]) -> tuple[Priors, Array, Array]:
         """Return their priors, scores and information among themselves, once faults are freed."""
         evidence, width = self._whole(grid), self.channels.width
-        for fault in faults:
-            combined, prior = combined_of(fault, grid, self.channels)
-            padded = np.zeros((len(evidence.score), combined.shape[1]))
-            padded[: grid.n_blocks * width] = combined
-            evidence = evidence.freed(padded, prior)
+        if faults:
+            combined, prior = combined_of(faults, grid, self.channels)
+            shared = np.zeros((len(evidence.score) - len(combined), combined.shape[1]))
+            evidence = evidence.freed(np.vstack([combined, shared]), prior)
         priors = self._nuisances.priors(*grid.coarse())
         crossed = priors.crossed(evidence, width)
         return priors, crossed.score, priors.among(crossed, width)
@@ -175,8 +174,7 @@ class Judge:
     def way_steps(self, judged: Judged, faults: Sequence[Fault]) -> Steps[Array]:
         """Return where the trajectory goes (K, 3), in body axes, m, if these are freed."""
         effect = -judged.restored
-        for fault, size in zip(faults, judged.sizes(faults), strict=True):
-            effect += judged.combined(fault)[0] @ size
+        effect += judged.combined(faults)[0] @ judged.sizes(faults)
         linear, columns = self.linear, self.channels.columns
         none = np.zeros((1, self.channels.width))  # before the blocks and after them
         of_block = np.concatenate([none, effect.reshape(judged.grid.n_blocks, -1), none])
@@ -217,39 +215,24 @@ class Judged:
         restored = self.restored.copy()
         for fault in faults:
             if fault.sizes is not None:
-                restored += self.combined(fault)[0] @ fault.sizes
+                restored += self.combined([fault])[0] @ fault.sizes
         score = self.evidence.score + self.evidence.information @ (restored - self.restored)
         return Judged(self.evidence._replace(score=score), self.grid, self.channels, restored)
 
     def with_freed(self, faults: Sequence[Fault]) -> Judged:
         """Return what is left once some faults may be of any size."""
-        evidence = self.evidence
-        for fault in faults:
-            combined, prior = self.combined(fault)
-            evidence = evidence.freed(combined, prior)
+        if not faults:
+            return self
+        evidence = self.evidence.freed(*self.combined(faults))
         return Judged(evidence, self.grid, self.channels, self.restored)
 
-    def combined(self, fault: Fault) -> tuple[Array, Array]:
-        """Return the columns of a fault as sums of those here, and its prior information."""
-        return combined_of(fault, self.grid, self.channels)
+    def combined(self, faults: Sequence[Fault]) -> tuple[Array, Array]:
+        """Return the columns of faults as sums of those here, and their prior information."""
+        return combined_of(faults, self.grid, self.channels)
 
-    def chi_sq(self, fault: Fault) -> float:
-        """Return by how much the data fit better with a fault freed."""
-        combined, prior = self.combined(fault)
-        score = combined.T @ self.evidence.score
-        inner = combined.T @ self.evidence.information @ combined + prior
-        return float(score @ np.linalg.solve(inner, score))
-
-    def sizes(self, faults: Sequence[Fault]) -> list[Array]:
-        """Return how large faults are if all of them are freed together."""
-        if not faults:
-            return []
-        parts = [self.combined(fault) for fault in faults]
-        combined = np.hstack([part for part, _ in parts])
-        prior = np.concatenate([np.diagonal(p) for _, p in parts])
-        inner = combined.T @ self.evidence.information @ combined + np.diag(prior)
-        size = np.linalg.solve(inner, combined.T @ self.evidence.score)
-        return np.split(size, np.cumsum([part.shape[1] for part, _ in parts])[:-1])
+    def sizes(self, faults: Sequence[Fault]) -> Array:
+        """Return how large faults are, one behind the other, if all of them are freed together."""
+        return self.evidence.sizes(*self.combined(faults))
 
     def best_of(
         self,
@@ -385,8 +368,15 @@ def _from_begin(inner: Array, score: Array, since: Array) -> tuple[Array, Array]
     return turned @ inner @ turned.swapaxes(1, 2), (turned @ score[..., None])[..., 0]
 
 
-def combined_of(fault: Fault, grid: Grid, channels: Channels) -> tuple[Array, Array]:
-    """Return the columns of a fault (N w, m) as sums of those of a grid, and its prior."""
+def combined_of(faults: Sequence[Fault], grid: Grid, channels: Channels) -> tuple[Array, Array]:
+    """Return the columns of faults (N w, m) as sums of those of a grid, and their prior (m, m)."""
+    parts = [_combined_of(fault, grid, channels) for fault in faults]
+    prior = np.diag(np.concatenate([sigma for _, sigma in parts]) ** -2.0)
+    return np.hstack([part for part, _ in parts]), prior
+
+
+def _combined_of(fault: Fault, grid: Grid, channels: Channels) -> tuple[Array, Array]:
+    """Return the columns of a fault, and the sigmas of its numbers."""
     hypothesis, width = fault.hypothesis, channels.width
     channel, C = channels.of(hypothesis.channel), hypothesis.combined
     begin, end = np.searchsorted(grid.edges, [fault.begin, fault.end]).tolist()
@@ -409,4 +399,4 @@ def combined_of(fault: Fault, grid: Grid, channels: Channels) -> tuple[Array, Ar
         if hypothesis.course is not Course.TREND:
             made = made[:, :, d:] if hypothesis.has_rate else made[:, :, :d]
     sigma = np.resize(hypothesis.sigma, made.shape[2])
-    return made.reshape(grid.n_blocks * width, -1), np.diag(1.0 / sigma**2)
+    return made.reshape(grid.n_blocks * width, -1), sigma

@@ -72,6 +72,8 @@ class FaultSearch:
     piece_s: float = 600.0
     """A longer mission is searched in pieces of this that overlap by half. Memory grows with its
     square, and time too; longer ones are surer of what is little off for longer."""
+    most_looks: int = 8
+    """After so many the search ends whatever it finds."""
 
     def __post_init__(self) -> None:
         for name in ("block_s", "significance", "margin", "piece_s"):
@@ -82,6 +84,8 @@ class FaultSearch:
             raise ConfigError(
                 f"piece_s: expected four blocks of {self.block_s} s or more, got {self.piece_s}"
             )
+        if self.most_looks < 1:
+            raise ConfigError(f"most_looks: expected 1 or more, got {self.most_looks}")
 
 
 class Beside(NamedTuple):
@@ -150,7 +154,7 @@ class Look:
                 chi_sq = left.table(one)[0][1:-1, -1]
                 begin = int(np.argmax(chi_sq))
                 jump = Fault(one, int(edges[1 + begin]), int(edges[-1]), float(chi_sq[begin]))
-                found.append(replace(jump, sizes=left.sizes([jump])[0]))
+                found.append(replace(jump, sizes=left.sizes([jump])))
         likeliest = max(found, key=lambda jump: jump.chi_sq)
         return [likeliest] if likeliest.chi_sq > POSSIBLE else []
 
@@ -386,7 +390,8 @@ def as_large_as_alone(fault: Fault, judged: Judged, others: Sequence[Fault]) -> 
     hypothesis = fault.hypothesis
     if hypothesis.course is Course.ANYTHING:
         return fault
-    alone = float(np.linalg.norm(judged.sizes([*others, replace(fault, onsets=())])[-1]))
+    own = judged.sizes([*others, replace(fault, onsets=())])[-fault.n_constants :]
+    alone = float(np.linalg.norm(own))
     sized = replace(hypothesis, sigma=np.minimum(hypothesis.sigma, AS_ALONE * alone))
     onsets = tuple(replace(ramp, hypothesis=sized) for ramp in fault.onsets)
     return replace(fault, hypothesis=sized, onsets=onsets)

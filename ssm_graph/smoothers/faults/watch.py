@@ -41,8 +41,6 @@ from ssm_graph.smoothers.faults.unstated import Unstated
 from ssm_graph.smoothers.faults.windows import noisier_than_stated
 from ssm_graph.smoothers.unwound import unwound_steps
 
-MOST_LOOKS = 8
-"""Looks after which the search ends whatever it finds."""
 SLOW: Final = 0.7
 """Of the update before, from which on a pass hardly comes nearer, and"""
 SLOW_PASSES: Final = 3
@@ -84,7 +82,8 @@ class FaultWatch:
         self._beams_out = np.zeros(len(problem.beams.speed), bool)
         self.aids_out = np.zeros(sum(len(aid) for aid in aids_of(problem)), bool)
         """(A,) measurements of aids that may have read anything"""
-        self._n_looks, self._is_done = 0, search is None
+        self._looks_left = 0 if search is None else search.most_looks
+        self._is_done = search is None
         self._last_update, self._n_slow = np.inf, 0
 
     def leave_out(self, weights: Array) -> Array:
@@ -126,7 +125,7 @@ class FaultWatch:
         """Search at the states, and free what is found; far from an answer nothing ends it."""
         assert self._bare is not None
         assert self._search is not None
-        self._n_looks += 1
+        self._looks_left -= 1
         own = states.constants[: self._problem.extras.n_constants]
         bare_states = states._replace(constants=own)
         yield from self._bare.integrate_steps(bare_states)
@@ -149,7 +148,7 @@ class FaultWatch:
         if is_same and not self._is_statement_judged:
             is_same = self._judge_statement(self._search.beside(judge, channels, known), judge)
         found.extend(self._undecided)
-        self._is_done = is_same or self._n_looks >= MOST_LOOKS
+        self._is_done = is_same or self._looks_left == 0
         if is_same:
             return None
         if self._is_done:
