@@ -66,7 +66,7 @@ class Evidence(NamedTuple):
         """Return how large (m,) ``combined`` (C, m), sums of columns, are."""
         used, columns = _used(combined)
         inner = columns.T @ self.information[np.ix_(used, used)] @ columns + prior
-        return np.linalg.solve(inner, columns.T @ self.score[used])
+        return np.asarray(np.linalg.solve(inner, columns.T @ self.score[used]))
 
 
 class OwnRows(NamedTuple):

@@ -2,13 +2,15 @@
 
 A filter that goes along cannot take back what it paired wrongly, and a little more or less trust in
 the observations leads it elsewhere. So it goes along several times; one time it remembers no
-landmark for long, so that it closes nothing, and what is met again stands in the map anew. Then,
-with the whole log smoothed, scans are paired anew along the path (`reassociation`), and landmarks
-that may be one by their joint covariance are taken as one (`merging`), where that costs less: where
-it bends the odometry less and explains more, with fewer landmarks. All opinions have one noise, so
-that their costs compare. Of the cheapest, and of those that cannot be told from it, the map is then
-made simpler, and stretches are tied to the rest anew, where that gains more than chance does
-(`is_better`). Where the others put the path tells whether it is sure.
+landmark for long, so that it closes nothing, and what is met again stands in the map anew. And
+particles go along, which pair in many ways at once (`particles`). Then, with the whole log
+smoothed, scans are paired anew along the path (`reassociation`), and landmarks that may be one by
+their joint covariance are taken as one (`merging`), where that costs less: where it bends the
+odometry less and explains more, with fewer landmarks, and with fewer that are in view and not seen
+(`sight`). All opinions have one noise, so that their costs compare. Of the cheapest, and of those
+that cannot be told from it, the map is then made simpler, and stretches are tied to the rest anew,
+where that gains more than chance does (`is_better`). Where the others put the path tells whether it
+is sure.
 """
 
 from __future__ import annotations
@@ -34,6 +36,7 @@ from ssm_graph.systems.landmark_slam.observation_noise import (
     successive,
     widened,
 )
+from ssm_graph.systems.landmark_slam.particles import pair_by_particles
 from ssm_graph.systems.landmark_slam.problem import UNKNOWN, SlamNoise, SlamProblem
 from ssm_graph.systems.landmark_slam.reassociation import (
     FITS,
@@ -42,6 +45,7 @@ from ssm_graph.systems.landmark_slam.reassociation import (
     price,
     reassociate,
 )
+from ssm_graph.systems.landmark_slam.sight import View, unseen
 from ssm_graph.systems.landmark_slam.smoother import (
     SmootherSettings,
     Values,
@@ -50,6 +54,8 @@ from ssm_graph.systems.landmark_slam.sparse import Quick, smooth_quickly
 
 TRUSTS: Final = ((1.0, 1.0), (1.5, 1.0), (1.0, 1.5))
 """By which the sigmas of ranges and bearings are multiplied while a first opinion is formed."""
+SWARMS: Final = 4
+"""Of particles: each of them ends with one pairing, and by chance another."""
 SIGMA_OF_MEDIAN: Final = 1.4826
 """A Gaussian's standard deviation over its median absolute value."""
 ALIKE: Final = 0.3
@@ -75,6 +81,8 @@ MOST_SWEEPS: Final = 3
 """Over all stretches, each tied to the rest anew."""
 MOST_ROUNDS: Final = 30
 """Of mergers."""
+MOST_IMPROVED: Final = 3
+"""Opinions, the cheapest ones."""
 
 
 class Opinion(NamedTuple):
@@ -85,7 +93,8 @@ class Opinion(NamedTuple):
     landmark: NDArray[np.intp]
     """(M,) of the log that came, `problem.UNKNOWN` of observations left out"""
     cost: float
-    """Of what observations and odometry are missed by, and of the landmarks that it takes."""
+    """Of what observations and odometry are missed by, of the landmarks that it takes, and of those
+    that are in view and not seen."""
     cov: Array
     """(2 L, 2 L) m^2 of its landmarks"""
     of_blocks: Array
@@ -104,7 +113,7 @@ def best_opinion(
         values, none = Values(opened.pose, opened.places), np.zeros(0)
         elsewhere = np.zeros(len(opened.pose))
         return Opinion(opened.problem, values, opened.landmark, np.inf, np.eye(0), none, elsewhere)
-    told = _told_noise(opened, noise, settings)
+    told, drift = _told(opened, noise, settings)
     short, its_noise, kept = problem.condensed(told)
     judge = _Judge(short, its_noise, settings)
     firsts = [(associate(problem, told, forgets), True)]
@@ -115,8 +124,13 @@ def best_opinion(
         judge.begun(first.landmark, Values(first.pose[kept], first.places), is_open)
         for first, is_open in firsts
     ]
-    cheapest = min(found, key=lambda one: one.cost)
-    for number, one in enumerate(found):
+    for seed in range(SWARMS):
+        drawn = pair_by_particles(short, its_noise, drift, seed=seed)
+        if len(drawn.values.landmarks):
+            found.append(judge.begun(drawn.landmark, drawn.values, False))
+    found.sort(key=lambda one: one.cost)
+    cheapest = found[0]
+    for number, one in enumerate(found[:MOST_IMPROVED]):
         if one.cost - cheapest.cost <= SURE * _noise(one, cheapest):
             found[number] = judge.improved(one)
     best = min(found, key=lambda one: one.cost)
@@ -134,6 +148,8 @@ class _Judge:
 
     def __init__(self, problem: SlamProblem, noise: SlamNoise, settings: SmootherSettings) -> None:
         self._problem, self._noise, self._settings = problem, noise, settings
+        self._block = ((problem.time_s - problem.time_s[0]) // MEMORY_S).astype(np.intp)
+        self._view = View.of(problem)
 
     def begun(self, landmark: NDArray[np.intp], begin: Values, is_open: bool) -> Opinion:
         """Return what comes of a first opinion, which may have closed nothing."""
@@ -213,12 +229,14 @@ class _Judge:
         """
         squares = np.full(len(landmark), FITS)
         squares[landmark >= 0] = np.square(found.rows.own_error).sum(axis=1)
-        block = ((self._problem.time_s - self._problem.time_s[0]) // MEMORY_S).astype(int)
+        block = self._block
         odometry = np.square(found.rows.between_error).sum(axis=1)
-        of_blocks = np.bincount(block[self._problem.keyframe], missed(squares), block[-1] + 1)
+        places = found.values.pose, found.values.landmarks
+        of_blocks = unseen(self._view, self._problem, block, *places, landmark)
+        of_blocks += np.bincount(block[self._problem.keyframe], missed(squares), len(of_blocks))
         of_blocks += np.bincount(block[1:], odometry, block[-1] + 1)
         of_blocks[0] += np.sum(np.square(found.values.drift / self._problem.drift_sigma))
-        return np.asarray(of_blocks, dtype=np.float64)
+        return of_blocks
 
     def _paired(self, opinion: Opinion, is_open: bool) -> Opinion:
         """Return an opinion with its scans paired anew for as long as that costs less."""
@@ -259,18 +277,22 @@ class _Judge:
         return None
 
 
-def _told_noise(first: Associated, noise: SlamNoise, settings: SmootherSettings) -> SlamNoise:
-    """Return noise whose observations have sigmas that what is missed asks for.
+def _told(
+    first: Associated, noise: SlamNoise, settings: SmootherSettings
+) -> tuple[SlamNoise, Array]:
+    """Return noise whose observations have sigmas that what is missed asks for, and the drift (d,).
 
     By its medians, and by how alike successive errors are; none is smaller than stated.
     """
     problem, begin = first.problem, Values(first.pose, first.places)
-    errors = smooth_quickly(problem, noise, begin, settings).rows.own_error
+    smoothed = smooth_quickly(problem, noise, begin, settings)
+    errors = smoothed.rows.own_error
     more = np.maximum(SIGMA_OF_MEDIAN * np.median(np.abs(errors), axis=0), 1.0)
     there = np.isfinite(problem.measured)
     alike = correlations(errors / more, there, successive(problem))
     alike = np.where(alike > ALIKE, MOST_ALIKE, alike)
-    return SlamNoise(noise.control, noise.observation * more * widened(alike))
+    told = SlamNoise(noise.control, noise.observation * more * widened(alike))
+    return told, smoothed.values.drift
 
 
 def is_better(new: Opinion, old: Opinion) -> bool:

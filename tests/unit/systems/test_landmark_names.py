@@ -22,8 +22,10 @@ from ssm_graph.systems.landmark_slam.filtered import filtered, first_values
 from ssm_graph.systems.landmark_slam.logs import LONGEST_STEP_S, LandmarkLog, problem_of_log
 from ssm_graph.systems.landmark_slam.merging import Map, all_merged
 from ssm_graph.systems.landmark_slam.models import between, composed
+from ssm_graph.systems.landmark_slam.particles import pair_by_particles
 from ssm_graph.systems.landmark_slam.problem import UNKNOWN, SlamNoise, SlamStatus
 from ssm_graph.systems.landmark_slam.reassociation import reassociate
+from ssm_graph.systems.landmark_slam.sight import View, unseen
 from ssm_graph.systems.landmark_slam.smoother import SmootherSettings, smooth_landmarks
 from ssm_graph.systems.landmark_slam.solve import Asked, solve
 from ssm_graph.systems.landmark_slam.sparse import smooth_quickly
@@ -182,6 +184,43 @@ def test_a_short_memory_closes_nothing() -> None:
         assert len(before) > 2
         assert len(after) > 2
         assert bool(np.isin(after, before).any()) is is_met
+
+
+def test_particles_pair_what_is_met_again_after_a_blind_stretch() -> None:
+    """With errors among what was seen; each landmark once in a scan, and the same for a seed."""
+    log = drive(RING, seen_s=((0.0, 25.0), (45.0, 70.0)), wrong=0.02)
+    rng = np.random.default_rng(1)
+    wrong = rng.random(len(log.seen)) < 0.1
+    log = replace(log, seen=np.where(wrong[:, None], rng.uniform([1, -1], [5, 1]), log.seen))
+    problem, noise, _ = problem_of_log(log).condensed(log.noise)
+    drawn = pair_by_particles(problem, noise, np.zeros(3), seed=0)
+    again = pair_by_particles(problem, noise, np.zeros(3), seed=0)
+    np.testing.assert_array_equal(drawn.landmark, again.landmark)
+    errors = association_errors(drawn.landmark[~wrong], problem.landmark[~wrong])
+    assert errors.n_wrong + errors.n_left_out < 0.1 * errors.n
+    assert errors.n_split <= 1
+    named = drawn.landmark >= 0
+    scans = np.column_stack([problem.keyframe, drawn.landmark])[named]
+    assert len(np.unique(scans, axis=0)) == len(scans)
+    assert drawn.landmark.max() == len(drawn.values.landmarks) - 1
+
+
+def test_a_place_that_is_there_twice_stays_unseen() -> None:
+    """It costs more than the one place; a log without a whole sighting has no view."""
+    log = drive(RING, seen_s=((0.0, 120.0),))
+    problem = problem_of_log(log)
+    pose = np.column_stack([np.interp(problem.time_s, log.truth_s, x) for x in log.truth.T])
+    block = ((problem.time_s - problem.time_s[0]) // 10.0).astype(np.intp)
+    view = View.of(problem)
+    assert 3.0 < view.farthest_m < 5.1
+    assert 0.8 < view.widest_rad < 1.25
+    once = unseen(view, problem, block, pose, RING, problem.landmark)
+    late = np.where((problem.landmark == 0) & (log.seen_s > 60.0), len(RING), problem.landmark)
+    twice = unseen(view, problem, block, pose, np.vstack([RING, RING[0]]), late)
+    assert once.shape == twice.shape == (block[-1] + 1,)
+    assert twice.sum() > once.sum() + 20.0
+    blind = replace(problem, measured=np.full_like(problem.measured, np.nan))
+    assert not View.of(blind).has(pose, RING).any()
 
 
 def test_leftovers_become_landmarks() -> None:
