@@ -102,7 +102,7 @@ class _Cloud:
     def __init__(self, problem: SlamProblem, noise: SlamNoise, drift: Array, seed: int) -> None:
         self._problem, self._rng = problem, np.random.default_rng(seed)
         self._view, self._first = View.of(problem), problem.first_of.tolist()
-        self._whole = np.isfinite(problem.measured).all(axis=1)
+        self._whole = np.all(np.isfinite(problem.measured), axis=1)
         self._variance = np.square(noise.observation * problem.scales)
         self._increments, self._slopes = problem.steps(), problem.slopes
         self._roots = problem.motion.basis(problem.control) * noise.control
@@ -162,9 +162,10 @@ class _Cloud:
         (N, 3, 3) of the poses.
         """
         now_s = self._problem.time_s[k]
-        lives = (self.count >= FEWEST) | (now_s - self.last_s < PATIENCE_S)
-        near = np.flatnonzero(np.any(lives, axis=0))
-        lives = np.take(lives, near, axis=1)
+        lives = self.count >= FEWEST
+        lives |= now_s - self.last_s < PATIENCE_S
+        near = np.flatnonzero(lives.any(axis=0))
+        lives = lives[:, near]
         for one in taken.T:
             lives &= near != one[:, None]
         seen = self._seen(row, near, P)
