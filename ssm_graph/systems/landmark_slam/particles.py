@@ -39,6 +39,8 @@ FEWEST: Final = 3
 """Sightings of a landmark that stays, and"""
 PATIENCE_S: Final = 5.0
 """for how long one with less is remembered."""
+FAR: Final = 2.0
+"""Times what was measured, or the view, from which on landmarks are not looked at."""
 AGAIN_S: Final = 10.0
 """Since a landmark was seen, from which on it speaks that it is not."""
 MISSED: Final = 0.12
@@ -161,15 +163,18 @@ class _Cloud:
         most. ``taken`` (N, m) are those of the scan's rows before. Also returns the covariance
         (N, 3, 3) of the poses.
         """
-        now_s = self._problem.time_s[k]
-        lives = self.count >= FEWEST
-        lives |= now_s - self.last_s < PATIENCE_S
+        now_s, at_m = self._problem.time_s[k], float(self._problem.measured[row, 0])
+        used = slice(0, int(self.n.max()))
+        lives = self.count[:, used] >= FEWEST
+        lives |= now_s - self.last_s[:, used] < PATIENCE_S
+        away_m = np.abs(self.places[:, used] - self.pose[:, None, :2]).max(axis=2)
+        lives &= away_m < FAR * max(at_m, self._view.farthest_m)
         near = np.flatnonzero(lives.any(axis=0))
         lives = lives[:, near]
         for one in taken.T:
             lives &= near != one[:, None]
         seen = self._seen(row, near, P)
-        A, at_m = len(near), float(self._problem.measured[row, 0])
+        A = len(near)
         odds = np.empty((PARTICLES, A + 2))
         odds[:, :A] = np.where(lives, seen.log_likelihood, -np.inf)
         odds[:, A] = np.log(NEW_PER_ERROR * ERRORS_PER_M2 * at_m)
