@@ -298,8 +298,9 @@ def test_many_leftovers_take_little_memory() -> None:
     assert peak < 20 * 2**20
 
 
-def test_unnamed_is_nearly_as_good_as_named() -> None:
+def test_unnamed_is_nearly_as_good_as_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """A log with a blind stretch and a turn rate that is wrong, through all stages."""
+    monkeypatch.setattr("ssm_graph.systems.landmark_slam.opinions.SWARMS", 1)
     log = drive(RING, seen_s=((0.0, 40.0), (70.0, 120.0)), wrong=0.01, seed=1)
     problem = problem_of_log(log)
     true = np.column_stack([np.interp(problem.time_s, log.truth_s, x) for x in log.truth.T])
