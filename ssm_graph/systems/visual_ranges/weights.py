@@ -115,7 +115,7 @@ class SightKernel(RangeKernel):
 
     def _log_in_sight(self, r: Array) -> Array:
         odds = np.log(self.share) - np.log1p(-np.asarray(self.share))
-        return -np.logaddexp(0.0, odds + log_longer(r, self.excess))
+        return np.asarray(-np.logaddexp(0.0, odds + log_longer(r, self.excess)))
 
 
 def log_longer(r: Array, excess: Array | float) -> Array:
