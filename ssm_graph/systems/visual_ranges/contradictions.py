@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ssm_graph.base.frozen import Array
 from ssm_graph.systems.visual_ranges.range_fit import BIAS_M, Problem, Solution, polished
 from ssm_graph.systems.visual_ranges.ranges import Indices
-from ssm_graph.systems.visual_ranges.weights import robust_rms
+from ssm_graph.systems.visual_ranges.weights import robust_rms, sight_kernel
 
 Mask = NDArray[np.bool_]
 
@@ -26,7 +26,7 @@ def contradictions(
     *,
     stated_m: Array,
     rms_sigmas: float,
-    marked_share: float,
+    long_share: float,
 ) -> list[str]:
     """Return what speaks against the ranges themselves, a sentence each.
 
@@ -35,12 +35,12 @@ def contradictions(
     names : (J,) of the anchors.
     stated_m : (M,) standard deviations as stated; the problem's may have been widened.
     rms_sigmas : up to which residuals may be wider than stated.
-    marked_share : of an anchor's ranges that may be too long.
+    long_share : of an anchor's ranges that may be too long, see :class:`.weights.SightKernel`.
     """
     at = problem.places
     told = misfits(
         names, at.anchor, best.error, at.sigma_m, best.biases,
-        stated_m=stated_m, rms_sigmas=rms_sigmas, marked_share=marked_share,
+        stated_m=stated_m, rms_sigmas=rms_sigmas, long_share=long_share,
     )  # fmt: skip
     first = at.time_s < np.median(at.time_s)
     halves = [polished(_part(problem, half), best) for half in (first, ~first)]
@@ -71,7 +71,7 @@ def misfits(
     *,
     stated_m: Array,
     rms_sigmas: float,
-    marked_share: float,
+    long_share: float,
 ) -> list[str]:
     """Return which anchors' ranges are wider, longer or more biased than may be, a sentence each.
 
@@ -79,9 +79,10 @@ def misfits(
     ----------
     anchor, error, sigma_m : (M,) of the ranges; errors are predicted minus measured, m.
     biases : (J,) m
-    stated_m, rms_sigmas, marked_share : as in :func:`contradictions`.
+    stated_m, rms_sigmas, long_share : as in :func:`contradictions`.
     """
     told = []
+    shares = np.broadcast_to(sight_kernel(error, sigma_m, anchor).share, error.shape)
     for j, name in enumerate(names):
         own = anchor == j
         stated, seen = float(np.median(stated_m[own])), robust_rms(error[own])
@@ -89,9 +90,9 @@ def misfits(
             told.append(f"residuals of anchor {name} are {seen:.2f} m, {stated:.2f} m were stated")
         if abs(biases[j]) > 3.0 * BIAS_M:
             told.append(f"the bias of anchor {name} would be {biases[j]:.2f} m")
-        marked = float(np.mean(error[own] < -4.0 * sigma_m[own]))
-        if marked > marked_share:
-            told.append(f"{100.0 * marked:.0f} % of the ranges to anchor {name} are too long")
+        share = float(np.median(shares[own]))
+        if share > long_share:
+            told.append(f"{100.0 * share:.0f} % of the ranges to anchor {name} are too long")
     return told
 
 

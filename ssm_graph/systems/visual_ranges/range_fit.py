@@ -21,7 +21,7 @@ import numpy as np
 from ssm_graph.base.frozen import Array, ReadOnlyArrays
 from ssm_graph.systems.visual_ranges.range_terms import CLOSEST_M, Places
 from ssm_graph.systems.visual_ranges.ranges import Indices
-from ssm_graph.systems.visual_ranges.weights import POLISH, RangeKernel
+from ssm_graph.systems.visual_ranges.weights import RangeKernel, sight_kernel
 
 BIAS_M: Final = 0.15
 """Prior standard deviation of an anchor's bias."""
@@ -39,6 +39,8 @@ ANCHOR_M: Final = 1e3
 ROUNDS: Final = 60
 SETTLED: Final = 1e-7
 """Relative change of the cost at which a search ends."""
+POLISHES: Final = 20
+"""Turns of share and solution, at most; they end when the scale moves by 0.01 sigma."""
 STEP_DEVIANCE: Final = 0.5
 """By which a reweighting may raise the deviance, which is not quite what it lowers."""
 SPACING_M: Final = 0.02
@@ -386,12 +388,19 @@ def _kept_step(problem: Problem, at: Array, step: Array) -> Array:
 
 
 def polished(problem: Problem, found: Solution) -> Solution:
-    """Return a minimum with what is far too long taken out of it: see :data:`.weights.POLISH`.
+    """Return a minimum by ranges in sight alone, as far as their errors tell: :class:`SightKernel`.
 
-    Its cost, and what that overstates, stay those of the kernel it was found by, so that minima can
-    be compared.
+    Share and excess of those that are too long are found with it, in turns. Its cost, and what that
+    overstates, stay those of the kernel it was found by, so that minima can be compared.
     """
-    last = solution(replace(problem, kernel=POLISH), found.unknowns, is_near=True, rounds=15)
+    at, last = problem.places, found
+    for _ in range(POLISHES):
+        error = residuals(problem, last.unknowns[None])[0][0]
+        kernel = sight_kernel(error, at.sigma_m, at.anchor)
+        before = last
+        last = solution(replace(problem, kernel=kernel), last.unknowns, is_near=True, rounds=5)
+        if abs(np.log(last.scale / before.scale)) < 0.01 * last.sigma_log_scale:
+            break
     return replace(last, cost=found.cost, understated=found.understated)
 
 

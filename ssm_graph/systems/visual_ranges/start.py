@@ -3,7 +3,7 @@
 Least squares would sit among the ranges that are too long, and its covariance would not tell of
 another solution. So all searches are robust from the beginning, the distinct minima are kept, and
 a scale counts as ready only where it is sharp, has no rival, fits its ranges and is the same from
-the first half of them as from the second.
+both halves of them.
 """
 
 from __future__ import annotations
@@ -81,8 +81,8 @@ class StartRules:
     """Deviance by which the next distinct minimum is worse, times what a deviance overstates."""
     rms_sigmas: float = 2.0
     """Robust rms of the residuals in stated sigmas."""
-    marked_share: float = 0.4
-    """Of an anchor's ranges that may be not in line of sight."""
+    long_share: float = 0.52
+    """Of an anchor's ranges that may be too long: 40 % are told as 47 to 53 %, half from 54 %."""
     drift: float = DRIFT
     """Of a path before ranges hold it; see :data:`.range_fit.DRIFT`."""
     ledger_drift: float = 0.001
@@ -157,7 +157,7 @@ def find_start(
     )
     found = _ends(problem, _candidates(problem))
     stated_m = problem.places.sigma_m
-    problem = widened(problem, solution(problem, found[0]))
+    problem = widened(problem, polished(problem, solution(problem, found[0])))
     ends = [solution(problem, one) for one in _ends(problem, found)]
     ends.sort(key=lambda one: one.cost)
     best, *rivals = (polished(problem, one) for one in ends)
@@ -368,7 +368,7 @@ def _judged(
     reasons += doubts
     against = contradictions(
         problem, names, best, stated_m=stated_m, rms_sigmas=rules.rms_sigmas,
-        marked_share=rules.marked_share,
+        long_share=rules.long_share,
     )  # fmt: skip
     shape = shape_of(
         problem.places.camera,

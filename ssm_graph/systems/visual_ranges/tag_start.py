@@ -397,7 +397,7 @@ def _judged(
     against = misfits(
         names, problem.anchor, found.ranges.error * problem.range_sigma, problem.range_sigma,
         np.median(found.values.biases, axis=0), stated_m=stated.range_sigma,
-        rms_sigmas=rules.rms_sigmas, marked_share=rules.marked_share,
+        rms_sigmas=rules.rms_sigmas, long_share=rules.long_share,
     )  # fmt: skip
     if against:
         return StartState.REFUSED, (*against,)
