@@ -32,7 +32,7 @@ from ssm_graph.smoothers.faults.columns import (
     linear_of_steps,
 )
 from ssm_graph.smoothers.faults.freeing import columns_of, freed_of, inside_of
-from ssm_graph.smoothers.faults.hypotheses import Course
+from ssm_graph.smoothers.faults.hypotheses import Course, chi_sq_at
 from ssm_graph.smoothers.faults.judged import Fault, Judge
 from ssm_graph.smoothers.faults.nuisances import Nuisances
 from ssm_graph.smoothers.faults.of_start import without_start
@@ -48,6 +48,8 @@ SLOW_PASSES: Final = 3
 """how many such passes in a row are waited for."""
 
 
+CHANCE: Final = 1e-3
+"""Probability of what is left of a fault by chance once the start is hardly known."""
 LOOK_AT_START: Final = "look at the start, [initial] where it is stated"
 
 
@@ -334,7 +336,7 @@ class FaultWatch:
                 yield one
                 continue
             left = without_start(prior, states, step, at)
-            if left.chi_sq < fault.chi_sq - fault.merit:
+            if left.chi_sq < chi_sq_at(CHANCE, at.stop - at.start):
                 rivals = (*one.rivals, f"the start: {left.off}")
                 one = replace(one, rivals=rivals, remedy=LOOK_AT_START)
             yield one
