@@ -69,7 +69,7 @@ class Evidence(NamedTuple):
         """Return how large (m,) ``combined`` (C, m), sums of columns, are."""
         used, columns = _used(combined)
         inner = columns.T @ self.information[np.ix_(used, used)] @ columns + prior
-        return np.linalg.solve(inner, columns.T @ self.score[used])
+        return np.asarray(np.linalg.solve(inner, columns.T @ self.score[used]))
 
 
 class OwnRows(NamedTuple):
@@ -275,12 +275,12 @@ def root_of(information: Array) -> Array:
     if not np.isfinite(information).all():
         raise SolverError("what the data say of a fault is no finite number")
     try:
-        return np.linalg.cholesky(information)
+        return np.asarray(np.linalg.cholesky(information))
     except np.linalg.LinAlgError:
         scale = np.sqrt(np.abs(np.diagonal(information)))
         value, turn = np.linalg.eigh(information / np.outer(scale, scale))
         half = turn * np.sqrt(np.maximum(value, ROUNDING * value[-1])) * scale[:, None]
-        root = np.linalg.qr(half.T, mode="r").T
+        root = np.linalg.qr(half.T).R.T
         return np.asarray(root * np.copysign(1.0, np.diagonal(root)))
 
 
