@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ssm_graph.base.errors import ConfigError, DataError, MissingExtraError, nearest_hint
+from ssm_graph.base.errors import ConfigError, DataError, MissingExtraError
 from ssm_graph.base.frames import rotation_zyx
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.times import nearest
@@ -195,19 +195,12 @@ class Result:
             self.posterior,
             self._imu,
             times,
-            point=self._point(point) if isinstance(point, str) else point,
+            point=read_mission_toml(self.mission_folder).point(point)
+            if isinstance(point, str)
+            else point,
             wants_covariance=covariance,
             on_progress=on_progress,
         )
-
-    def _point(self, name: str) -> Point:
-        points = self.points
-        if name not in points:
-            raise ConfigError(
-                f"--point: {name!r} is none of the vehicle, {nearest_hint(name, points)}; add "
-                "[[point]] with name and lever_arm_m to mission.toml"
-            )
-        return points[name]
 
     def track(self, time_s: ArrayLike | None = None, **asked: Any) -> Track:
         """Return a track for :func:`ssm_graph.export_track`; parameters as of :meth:`answers`."""

@@ -75,8 +75,18 @@ class ShortRepr:
 
 
 def read_only(name: str, value: ArrayLike, shape: Sequence[int | None]) -> Array:
-    """Return a read-only float copy of ``value`` after checking its shape (None matches any)."""
-    array = np.array(value, dtype=np.float64)
+    """Return a read-only float copy of ``value`` after checking its shape (None matches any).
+
+    Raises :class:`DataError` for another shape and for what is no number: dates would be counted
+    in the ticks of their own clock.
+    """
+    try:
+        given = np.asarray(value)
+        if given.dtype.kind in "mMc":
+            raise DataError(f"{name}: expected numbers, times in seconds, got {given.dtype}")
+        array = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{name}: expected numbers in rows of one length, got: {error}") from error
     expected = tuple(shape)
     if array.ndim != len(expected) or any(
         want is not None and got != want for got, want in zip(array.shape, expected, strict=False)

@@ -73,6 +73,24 @@ def asks(arguments: argparse.Namespace) -> bool:
     return any(one is not None for one in wanted) or bool(arguments.covariance)
 
 
+def check_asked(arguments: argparse.Namespace) -> None:
+    """Refuse what no answer can be given for, before the work."""
+    from ssm_graph.io.export.track import parse_epoch
+    from ssm_graph.io.mission_folder.toml import read_mission_toml
+    from ssm_graph.smoothers.between import check_rate
+
+    if arguments.at is not None and arguments.rate is not None:
+        raise ConfigError("--at: expected alone, got --rate besides; leave one of them out")
+    if arguments.epoch is not None:
+        parse_epoch(arguments.epoch)
+    if arguments.rate is not None:
+        check_rate(arguments.rate)
+    if arguments.at is not None:
+        read_times(arguments.at, 0.0)
+    if arguments.point is not None and arguments.mission is not None:
+        read_mission_toml(arguments.mission).point(arguments.point)
+
+
 def asked_track(arguments: argparse.Namespace, result: Path, errors: Console) -> Asked:
     """Return the track of a result folder that was asked for.
 
@@ -84,13 +102,12 @@ def asked_track(arguments: argparse.Namespace, result: Path, errors: Console) ->
     from ssm_graph.io.results.tables import read_results
     from ssm_graph.report.terminal.progress import ProgressDisplay
 
+    check_asked(arguments)
     if not asks(arguments):
         epoch_s = None if arguments.epoch is None else parse_epoch(arguments.epoch)
         return Asked(track_of(read_results(result), epoch_s=epoch_s), "", ())
     from ssm_graph.result import Result
 
-    if arguments.at is not None and arguments.rate is not None:
-        raise ConfigError("--at: expected alone, got --rate besides; leave one of them out")
     of = Result(result, mission=arguments.mission, epoch=arguments.epoch)
     time_s, suffix, notes = _times(arguments, of.posterior, of.epoch_s)
     with ProgressDisplay(errors) as show:

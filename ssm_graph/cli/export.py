@@ -11,7 +11,7 @@ from rich.console import Console
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.cli.answers import add_answer_arguments, asked_track
 from ssm_graph.cli.terminal import say
-from ssm_graph.io.export.formats import FORMATS, export_track
+from ssm_graph.io.export.formats import FORMATS, check_format, export_track
 from ssm_graph.io.results.place import check_output_file
 
 DESCRIPTION = f"""\
@@ -53,6 +53,8 @@ def declare(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace, console: Console, errors: Console) -> bool:
     """Write every format that was asked for."""
     names = [name.strip() for name in arguments.format.split(",") if name.strip()]
+    for name in names:
+        check_format(name)
     result: Path = arguments.result.resolve()
     out: Path = arguments.out or exports_of(result)
     if result in (out.resolve(), *out.resolve().parents):
@@ -89,7 +91,7 @@ def export(
         say(console, note)
     stem = "".join(c if c.isalnum() or c in "-_." else "_" for c in asked.track.name)[:80]
     for name in names:
-        suffix = FORMATS[name].suffix if name in FORMATS else ""
+        suffix = FORMATS[name].suffix
         is_whole = is_file and len(names) == 1 and bool(out.suffix)
         path = out if is_whole else out / f"{stem}{asked.suffix}{suffix}"
         check_output_file(path, *([arguments.at] if arguments.at else []))

@@ -207,7 +207,10 @@ def main(words: Sequence[str] | None = None) -> int:
     except MemoryError as error:
         say(errors, f"error: out of memory: {str(error) or 'for what was asked for'}")
         code = ExitCode.DATA
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, ImportError) as error:
+        # A package in C that is loaded meanwhile says of the interrupt that it could not begin.
+        if not isinstance(error.__cause__ or error, KeyboardInterrupt):
+            raise
         errors.print("interrupted")
         code = ExitCode.INTERRUPTED
     failure = getattr(console.file, "failure", None)

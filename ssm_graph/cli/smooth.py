@@ -12,7 +12,7 @@ from factors.kernels import KERNELS, GeneralKernel, KernelChoice, TruncatedKerne
 from factors.similarity import Kernel, Similarity
 from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.usual import MAX_ITERATIONS
-from ssm_graph.cli.answers import add_answer_arguments, asks, read_times
+from ssm_graph.cli.answers import add_answer_arguments, asks, check_asked
 from ssm_graph.cli.options import (
     add_kernel_options,
     choice_option,
@@ -132,8 +132,7 @@ def run(arguments: argparse.Namespace, console: Console, errors: Console) -> boo
         assert dive.estimate is not None
         return dive.estimate
 
-    if arguments.at is not None:
-        read_times(arguments.at, 0.0)  # what cannot be read is said before the work
+    check_asked(arguments)
     is_good = run_mission(arguments, console, errors, solve, _settings(loop))
     if asks(arguments):
         result: Path = arguments.out.resolve()

@@ -22,9 +22,12 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.linalg.blas import dsyrk
 
+from ssm_graph.base.errors import SolverError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.chain import ChainSolution
 
+ROUNDING = 1e-10
+"""Share of the largest eigenvalue below which one is rounding: sums of some 1e5 rows, twice."""
 TILE = 256
 """Rows and columns that are mirrored at a time."""
 
@@ -46,7 +49,7 @@ class Evidence(NamedTuple):
         crossed : (m, C) their information with the columns here.
         inner : (m, m) that among themselves, with that of their prior.
         """
-        root = np.linalg.cholesky(inner)
+        root = root_of(inner)
         right = np.column_stack([crossed, score])
         half = solve_triangular(root, right, lower=True, check_finite=False, overwrite_b=True)
         # BLAS counts by columns: the transpose, which is the same, needs no turning round.
@@ -259,6 +262,26 @@ class ChainEvidence:
         place = np.argsort(order)
         flat = [history[place[i], : length[i]].reshape(-1, size) for i in range(len(length))]
         return flat, [onward[place[i]] for i in range(len(length))]
+
+
+def root_of(information: Array) -> Array:
+    """Return the lower root of an information with that of a prior.
+
+    A wrong unit makes columns of 1e12 times their priors that are alike: what is left of one beside
+    another is rounding then, of either sign, and such a one is taken for as little known as that.
+
+    Raises :class:`SolverError` where it is not finite.
+    """
+    if not np.isfinite(information).all():
+        raise SolverError("what the data say of a fault is no finite number")
+    try:
+        return np.asarray(np.linalg.cholesky(information))
+    except np.linalg.LinAlgError:
+        scale = np.sqrt(np.abs(np.diagonal(information)))
+        value, turn = np.linalg.eigh(information / np.outer(scale, scale))
+        half = turn * np.sqrt(np.maximum(value, ROUNDING * value[-1])) * scale[:, None]
+        root = np.linalg.qr(half.T).R.T
+        return np.asarray(root * np.copysign(1.0, np.diagonal(root)))
 
 
 def _used(combined: Array) -> tuple[NDArray[np.intp], Array]:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ssm_graph.base.frozen import Array
-from ssm_graph.imu.preintegration import imu_gaps
 from ssm_graph.imu.thinned import MOST_MISSING, sampling_interval, unseen_steps
-from ssm_graph.sensors.imu import ImuLog
+from ssm_graph.sensors.imu import ImuLog, imu_gaps
 
 
 def notes_of_missing(imu: ImuLog, keyframe_s: Array) -> tuple[str, ...]:

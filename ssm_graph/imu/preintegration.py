@@ -17,10 +17,9 @@ from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frozen import Array, Vector
 from ssm_graph.base.progress import told
 from ssm_graph.base.stepwise import Steps, at_once, finished
-from ssm_graph.base.times import usual_interval
 from ssm_graph.imu.increments import MergedSamples, merge_samples_steps
 from ssm_graph.imu.thinned import sampling_interval, unseen_steps
-from ssm_graph.sensors.imu import FrozenAxis, ImuLog, ImuNoise, frozen_axes
+from ssm_graph.sensors.imu import FrozenAxis, ImuLog, ImuNoise, frozen_axes, imu_gaps
 
 AT_ONCE = 16
 """So many intervals are read from GTSAM at a time: some 1.6 ms."""
@@ -319,14 +318,6 @@ def imu_params(
         max(noise.accel_bias_walk, floor * noise.accel_bias_sigma) ** 2 * eye
     )
     return params
-
-
-def imu_gaps(imu: ImuLog) -> tuple[Array, Array]:
-    """Return begin and end of every gap: an interval far longer than the usual one, s."""
-    edges = np.concatenate([[imu.start_s], imu.time_s])
-    spacing = np.diff(edges)
-    is_gap = spacing > max(0.1, 5.0 * usual_interval(edges))
-    return edges[:-1][is_gap], edges[1:][is_gap]
 
 
 def _unseen(

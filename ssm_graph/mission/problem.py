@@ -44,6 +44,8 @@ from ssm_graph.sensors.imu import frozen_axes
 from ssm_graph.sensors.seabed import TerrainLog
 
 SHORTEST_INTERVAL_S = 0.01
+SLOWEST_MERGE_HZ = 5.0
+"""In waves heights are as good as from 20 Hz; from 1 Hz half of them are beyond three sigma."""
 NO_EXTRAS = Extras()
 A = TypeVar("A", bound=Aid)
 
@@ -62,6 +64,11 @@ class ProblemConfig:
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0.0):
                 raise ConfigError(f"{name}: expected a number above zero, got {value}")
+        if self.merge_rate_hz < SLOWEST_MERGE_HZ:
+            raise ConfigError(
+                f"merge_rate_hz: expected {SLOWEST_MERGE_HZ:g} Hz or more, got "
+                f"{self.merge_rate_hz:g}; how waves move the vehicle would be merged away"
+            )
         if self.keyframe_interval_s < SHORTEST_INTERVAL_S:
             raise ConfigError(
                 f"keyframe_interval_s: expected {SHORTEST_INTERVAL_S:g} s or more, got "

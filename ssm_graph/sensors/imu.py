@@ -19,6 +19,7 @@ from ssm_graph.base.frames import BodyAxes, to_frd
 from ssm_graph.base.frozen import Array, FrozenArrays, Vector, shaped
 from ssm_graph.base.settings import FILE_KEY, Key, Settings, optional_key, sigma_key
 from ssm_graph.base.tables import Table
+from ssm_graph.base.times import usual_interval
 from ssm_graph.base.units import DEG_PER_H, DEGREE, MICRO_G, PER_SQRT_H
 from ssm_graph.sensors.frozen import USUALLY_EQUAL, frozen_runs
 from ssm_graph.sensors.imu_calibration import CALIBRATED, ImuCalibration, calibration_keys
@@ -162,6 +163,14 @@ def frozen_now(rows: Array) -> list[FrozenAxis]:
         if end_s - begin_s >= FROZEN_S and not is_usual:
             found.append(FrozenAxis(axis < 3, axis % 3, begin_s, end_s))
     return found
+
+
+def imu_gaps(imu: ImuLog) -> tuple[Array, Array]:
+    """Return begin and end of every gap: an interval far longer than the usual one, s."""
+    edges = np.concatenate([[imu.start_s], imu.time_s])
+    spacing = np.diff(edges)
+    is_gap = spacing > max(NOTED_GAP_S, 5.0 * usual_interval(edges))
+    return edges[:-1][is_gap], edges[1:][is_gap]
 
 
 class Stamp(Enum):

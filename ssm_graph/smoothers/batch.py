@@ -210,7 +210,7 @@ class SsmSmoother:
             )
         inertial = inertial_fit(linearizer.inertial_rows(this.states), this.step)
         yield 0.02 * problem.n_keyframes
-        freed = faults.faults(this.states, inertial)
+        freed = faults.faults(this.states, this.step, inertial)
         found = (*problem.faults, *freed, *(one for one in left if not one.is_rest_of(freed)))
         kernel = weights.of_beams.wanted
         notes = (*problem.notes, *(fault.sentence for fault in found), *_notes_of(first))

@@ -27,7 +27,7 @@ import numpy as np
 
 from factors import so3
 from factors.inertial import Intervals, predict
-from ssm_graph.base.errors import DataError
+from ssm_graph.base.errors import ConfigError, DataError
 from ssm_graph.base.frames import rotation_zyx
 from ssm_graph.base.frozen import Array, ShortRepr
 from ssm_graph.base.times import Indices, usual_interval
@@ -127,13 +127,18 @@ def answers_at(
     return Answers(Trajectory(*joined), np.concatenate(wholes)[order] if wholes else None)
 
 
+def check_rate(rate_hz: float) -> None:
+    """Raise :class:`ConfigError` for a rate that is no number from 1e-3 to 1e4 Hz."""
+    if not 1e-3 <= rate_hz <= 1e4:
+        raise ConfigError(f"--rate: expected 0.001 to 10000 Hz, got {rate_hz:g}")
+
+
 def even_times(posterior: Posterior, rate_hz: float) -> Array:
     """Return times (N,) at a rate from the first keyframe to the last, s.
 
-    Raises :class:`DataError` for a rate that is no number from 1e-3 to 1e4 Hz.
+    Raises as :func:`check_rate`.
     """
-    if not 1e-3 <= rate_hz <= 1e4:
-        raise DataError(f"--rate: expected 0.001 to 10000 Hz, got {rate_hz:g}")
+    check_rate(rate_hz)
     begin_s, end_s = posterior.time_s[0], posterior.time_s[-1]
     count = int((end_s - begin_s) * rate_hz + 1e-6) + 1
     return np.asarray(np.minimum(begin_s + np.arange(count) / rate_hz, end_s))

@@ -93,6 +93,27 @@ def test_what_is_ignored_stays_so(
     assert read_results(tmp_path / "run").summary["ended"] == "its time was over"
 
 
+@pytest.mark.parametrize(("cause", "ends"), [(KeyboardInterrupt(), 130), (None, None)])
+def test_a_package_that_is_interrupted_while_it_loads(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    cause: BaseException | None,
+    ends: int | None,
+) -> None:
+    """Its ImportError is the interrupt's; any other is a defect that is shown."""
+
+    def run(*_: object) -> bool:
+        raise ImportError("initialization failed") from cause
+
+    monkeypatch.setattr("ssm_graph.cli.instruments.run", run)
+    if ends is None:
+        with pytest.raises(ImportError):
+            main(["instruments"])
+        return
+    assert main(["instruments"]) == ends
+    assert capsys.readouterr().err == "interrupted\n"
+
+
 @pytest.mark.parametrize("number", SIGNALS)
 def test_other_commands_are_interrupted_by_any_of_them(
     tmp_path: Path,

@@ -514,12 +514,43 @@ def test_tables_of_other_loggers(tmp_path: Path) -> None:
         "t|p\n0.5|1.0\n1.0|2.0\n",
         " t   p\n 0.5  1.0 \n1.0 2.0\n",
         "t,p\ns,bar\n0.5,1\n1,2\n",
+        "t\tp\n0,5\t1,0\n1,0\t2\n",
+        "t;p;H\u00f6he (\u00b0)\n0,5;1,0;1\n1,0;2;1\n",
     ):
         path = tmp_path / "other.csv"
-        path.write_text(text)
+        path.write_text(text, encoding="cp1252")
         found = read_source(path)
         assert found.numbers("t", "x").tolist() == [0.5, 1.0]
         assert found.numbers("p", "x").tolist() == [1.0, 2.0]
+    assert found.numbers("H\u00f6he (\u00b0)", "x").tolist() == [1.0, 1.0]
+    path.write_text("t\tp\n0.5\t1,000\n1.0\t999.5\n")
+    with pytest.raises(DataError, match=r"other.csv:2: column 'p' holds '1,000'"):
+        read_source(path).numbers("p", "x")
+
+
+@pytest.mark.parametrize("end", ["", "3.0", "3.0,", "3.0,7", "3.0,7.12345e-", "3.0,-"])
+def test_a_line_that_ends_with_the_file_is_no_reading(tmp_path: Path, end: str) -> None:
+    """A number that was cut is a number, too."""
+    path = tmp_path / "log.csv"
+    path.write_text("t,p\n1.0,7.12345\n2.0,7.12346\n" + end)
+    found = read_source(path)
+    assert found.numbers("t", "x").tolist() == [1.0, 2.0, 3.0][: 3 if end == "3.0," else 2]
+    assert len(found.notes) == bool(end)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", "the file is empty"),
+        ("t,p\n", "a header and no rows"),
+        ("0,5;1,5\n1;2\n", "add a header"),
+    ],
+)
+def test_tables_without_rows_or_header(tmp_path: Path, text: str, told: str) -> None:
+    """Each is told by what it lacks."""
+    (tmp_path / "log.csv").write_text(text)
+    with pytest.raises(DataError, match=told):
+        read_source(tmp_path / "log.csv")
 
 
 def test_templates_are_valid(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

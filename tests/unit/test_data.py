@@ -69,6 +69,21 @@ def test_wrong_shapes_are_named(changes: dict[str, Any], message: str) -> None:
         imu_log(**changes)
 
 
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (np.array(["2026-05-01T10:00:00"], "datetime64[ns]"), r"got datetime64\[ns\]"),
+        (np.array([1.0 + 2.0j]), "got complex128"),
+        (["ten"], "could not convert string to float"),
+        ([[1.0], [1.0, 2.0]], "rows of one length"),
+    ],
+)
+def test_what_is_no_number_is_named(given: Any, told: str) -> None:
+    """A date counted in nanoseconds is no time in seconds."""
+    with pytest.raises(DataError, match=f"^log.time_s: expected numbers.*{told}"):
+        read_only("log.time_s", given, (None,))
+
+
 def test_fixed_shapes_do_not_follow_the_time() -> None:
     """A mount has no time; its shapes are its own."""
     mount = default_mount()

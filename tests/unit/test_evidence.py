@@ -5,9 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ssm_graph.base.errors import SolverError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.chain import ChainSolution
-from ssm_graph.engine.evidence import BetweenRows, ChainEvidence, Columns, Evidence, OwnRows
+from ssm_graph.engine.evidence import (
+    BetweenRows,
+    ChainEvidence,
+    Columns,
+    Evidence,
+    OwnRows,
+    root_of,
+)
 
 K, N, M, WIDE = 30, 15, 90, 6
 
@@ -88,3 +96,18 @@ def test_columns_are_eliminated_with_their_prior() -> None:
     combined[[8, 9], [0, 1]] = 1.0
     freed = Evidence(every.T @ missed, every.T @ every).freed(combined, prior)
     np.testing.assert_allclose(freed.information[:8, :8], left.information, atol=1e-12)
+
+
+def test_what_is_rounding_beside_another_is_taken_for_little_known() -> None:
+    """Two columns that are alike but for rounding."""
+    alike = np.array([[8e10, 2e10, 2e10], [2e10, 1e10, 1e10], [2e10, 1e10, 1e10 - 1e-3]])
+    with pytest.raises(np.linalg.LinAlgError):
+        np.linalg.cholesky(alike)
+    root = root_of(alike)
+    assert np.allclose(root, np.tril(root))
+    assert np.all(np.diagonal(root) > 0.0)
+    np.testing.assert_allclose(root @ root.T, alike, rtol=1e-8)
+    sound = np.array([[2.0, 1.0], [1.0, 3.0]])
+    np.testing.assert_array_equal(root_of(sound), np.linalg.cholesky(sound))
+    with pytest.raises(SolverError, match="no finite number"):
+        root_of(np.full((2, 2), np.inf))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -492,8 +493,9 @@ def test_what_stands_out_is_apart_from_what_lasts() -> None:
 @pytest.mark.parametrize("name", ["block_s", "significance", "margin"])
 def test_settings_are_checked(name: str) -> None:
     """Nothing below zero."""
+    given: dict[str, Any] = {name: 0.0}
     with pytest.raises(ConfigError, match=f"{name}: expected a number above zero"):
-        FaultSearch(**{name: 0.0})
+        FaultSearch(**given)
 
 
 @pytest.mark.slow

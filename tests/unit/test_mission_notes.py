@@ -154,6 +154,13 @@ def test_odd_mission_loads_with_a_note(tmp_path: Path, case: str) -> None:
         assert word in notes[0]
 
 
+def test_a_short_part_of_a_log_is_no_clock_in_other_units(tmp_path: Path) -> None:
+    """Two of sixty seconds: what lies around them is counted, not refused."""
+    notes = notes_after(tmp_path, lines("imu.csv", lambda rows: rows[:41]))
+    assert notes[0] == "dvl.csv: 57 of 60 rows lie outside the time of the IMU"
+    assert all("lie outside the time of the IMU" in note for note in notes)
+
+
 SOUND: dict[str, Damage] = {
     "all of it off the water": both(
         new_column("dvl.csv", "water_track", lambda _: "1"),

@@ -64,6 +64,14 @@ def test_a_level_bias_is_seen_under_way(waves: Mission) -> None:
     assert abs(np.radians(z) / 3600.0) < 1e-3
 
 
+def test_turns_in_a_gap_are_no_bias(waves: Mission) -> None:
+    """Nobody saw them."""
+    imu = waves.imu
+    kept = (imu.time_s < 50.0) | (imu.time_s > 55.0)
+    rows = {name: getattr(imu, name)[kept] for name in ("time_s", "gyro_b", "accel_b")}
+    assert check_motion(replace(waves, imu=replace(imu, **rows)), LABELS) == []
+
+
 def test_turns_under_way_are_no_bias_of_good_gyros() -> None:
     """What draws a vehicle inwards turns with it: as much as 40 to 70 deg/h, and none is said."""
     config = scenario_config("demo", duration_s=1800.0, grade=Grade.NAVIGATION, imu_rate_hz=50.0)

@@ -23,12 +23,11 @@ from ssm_graph.imu.preintegration import (
     bridged,
     gravity_between,
     gtsam_gravity,
-    imu_gaps,
     imu_params,
     preintegrate,
 )
 from ssm_graph.mission.problem import NO_EXTRAS, ProblemConfig, build_problem
-from ssm_graph.sensors.imu import ImuLog, ImuNoise
+from ssm_graph.sensors.imu import ImuLog, ImuNoise, imu_gaps
 from ssm_graph.simulation import IMU_NOISE, Grade, SurveyRoute
 from tests.helpers import assert_consistent, simulated, true_states
 

@@ -204,6 +204,12 @@ def test_gyro_of_a_single_sample() -> None:
     np.testing.assert_allclose(got, np.tile([1.0, 2.0, 3.0], (3, 1)))
 
 
+def test_a_merge_rate_that_waves_do_not_survive_is_refused() -> None:
+    """Heights from 1 Hz are wrong, and nothing says so."""
+    with pytest.raises(ConfigError, match="merge_rate_hz: expected 5 Hz or more, got 1;"):
+        ProblemConfig(merge_rate_hz=1.0)
+
+
 @pytest.mark.parametrize("name", ["merge_rate_hz", "keyframe_interval_s"])
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
 def test_bad_settings_are_refused(name: str, value: float) -> None:

@@ -147,6 +147,13 @@ def test_a_gap_of_the_inertial_data_accuses_nobody() -> None:
     assert {found.sensor for found in find_suspects(with_imu(mission, **rows))} == {"gyros"}
 
 
+def test_pings_beyond_the_inertial_data_say_nothing() -> None:
+    """Half of the pings have none to be compared with, as after a clock set by a minute."""
+    mission = simulated(duration_s=120.0, seed=4).mission
+    later = replace(mission.dvl, time_s=mission.dvl.time_s + 60.0)
+    assert any(one.sensor == "DVL" for one in find_suspects(replace(mission, dvl=later)))
+
+
 @pytest.mark.slow
 def test_other_lies_accuse_no_clock() -> None:
     """A position that jumps, a bottom that moves: no clock, no unit explains them."""

@@ -19,13 +19,24 @@ from ssm_graph.mission.answer import SUSPECT_STRETCH_S
 from ssm_graph.mission.estimate import Status
 from ssm_graph.mission.fault import DetectedFault, Treatment
 from ssm_graph.mission.problem import Problem, build_problem
-from ssm_graph.simulation import DiveRoute, GnssSettings, Grade, SimulatedMission, TransitRoute
+from ssm_graph.simulation import (
+    DiveRoute,
+    Fault,
+    FaultShape,
+    GnssSettings,
+    Grade,
+    SimulatedMission,
+    TransitRoute,
+)
+from ssm_graph.smoothers.faults.search import FaultSearch
 from ssm_graph.smoothers.faults.windows import (
     informative,
     most_by_noise,
     noisy_or_compared,
     parity_of,
 )
+from ssm_graph.smoothers.mission import smooth
+from ssm_graph.smoothers.settings import SmootherConfig
 from ssm_graph.smoothers.verdict import LEAST_EFFICIENCY, contradictions, efficiency
 from tests.helpers import outcome, simulated, true_states, with_imu, with_initial
 
@@ -271,6 +282,40 @@ def test_no_beams_no_doubt() -> None:
     lost = dataclasses.replace(dvl, speed=np.full_like(dvl.speed, np.nan))
     problem = build_problem(dataclasses.replace(sim.mission, dvl=lost))
     assert doubts_at(problem, true_states(problem, sim)) == []
+
+
+@pytest.mark.parametrize(
+    ("grade", "off", "says"),
+    [
+        (
+            Grade.NAVIGATION,
+            {"velocity_enu": np.array([0.3, -0.4, 0.0])},
+            "its velocity is off by 0.5",
+        ),
+        (Grade.NAVIGATION, {"heading": np.radians(10.0)}, "its attitude is off by 1"),
+        (Grade.TACTICAL, {"heading": np.radians(10.0)}, "its"),
+    ],
+)
+def test_what_the_start_alone_says_of_a_sensor_is_doubted(
+    grade: Grade, off: dict[str, Any], says: str
+) -> None:
+    """A start that is off by ten sigmas and more looks like a bottom that moves all the time."""
+    mission = simulated(duration_s=60.0, grade=grade, seed=1).mission
+    assert mission.initial is not None
+    changes = {key: getattr(mission.initial, key) + value for key, value in off.items()}
+    estimate = smooth(with_initial(mission, **changes), SmootherConfig(fault_search=FaultSearch()))
+    assert estimate.status is Status.SUSPECT
+    assert f"the start: {says}" in estimate.reason
+
+
+def test_what_fixes_say_of_a_sensor_is_not_doubted_for_the_start() -> None:
+    """The bottom moves all the time, and fixes tell."""
+    moves = Fault(shape=FaultShape.MOVING_BOTTOM, size=(0.2, 0.3, 0.0))
+    seen = GnssSettings(windows=((0.0, 60.0),))
+    mission = simulated(duration_s=60.0, gnss=seen, faults=(moves,), seed=1).mission
+    estimate = smooth(mission, SmootherConfig(fault_search=FaultSearch()))
+    assert any(fault.sensor == "DVL" and not fault.is_suspect for fault in estimate.faults)
+    assert "the start" not in " ".join(estimate.notes)
 
 
 @pytest.mark.parametrize("grade", Grade, ids=lambda grade: grade.name)

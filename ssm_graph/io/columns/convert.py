@@ -102,6 +102,7 @@ def logs_of_columns(files: Sequence[Path], column_map: ColumnMap, vehicle: Vehic
         path = column_map.file_of(section, tuple(files))
         if path not in sources:
             sources[path] = read_source(path)
+            notes += sources[path].notes
         if section.name not in bare:
             raise ConfigError(
                 f"{section.place}: the vehicle has no [{section.name}]; expected one with its "
@@ -371,7 +372,8 @@ class MappedFile(TableFile):
         if bare not in self.source.columns:
             return name or "a constant of the map"
         text = self.source.cell(int(self.rows[row]), bare)
-        return f"{text} {unit}".rstrip() + f" ({name!r} of {self.source.label})"
+        held = f"{text} {unit}".rstrip() if text else "nothing"
+        return f"{held} ({name!r} of {self.source.label})"
 
 
 def _origins(section: MapSection, one: Instrument, bare: Any) -> dict[str, tuple[str, str]]:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from ssm_graph.base.errors import DataError, MissingExtraError, nearest_hint
 from ssm_graph.base.progress import told
 from ssm_graph.io.file_kind import CSV_ENDINGS
+from ssm_graph.io.tables.csv_tables import TAIL_LINES, is_cut_off, open_end
 from ssm_graph.io.tables.files import pyarrow_module
 
 _HDF5: Final = (".h5", ".hdf5", ".nc")
@@ -47,8 +48,10 @@ class Source:
     """Texts (a list) or an array (N,), by name."""
     lines: Sequence[int] = field(default_factory=tuple)
     """(N,) line of each row in a text; empty where rows are counted."""
-    is_decimal_comma: bool = False
-    """Numbers are written 1,5."""
+    has_decimal_commas: bool = False
+    """Numbers may be written 1,5, in a column without points."""
+    notes: tuple[str, ...] = ()
+    """What is odd about the file."""
 
     def place(self, row: int) -> str:
         """Return where a row is: its line in a text, else its number, counted from 1."""
@@ -75,14 +78,14 @@ class Source:
                     'numbers; times that are texts or dates have the unit "iso"'
                 )
             return np.asarray(cells, np.float64)
-        if self.is_decimal_comma:
+        if self.has_decimal_commas and not any("." in cell for cell in cells):
             cells = [cell.replace(",", ".") for cell in cells]
         words = {"": "nan", "true": "1", "false": "0"}
         cells = [words.get(cell.lower(), cell) for cell in cells]
         try:
             return np.array(cells, np.float64)
         except ValueError:
-            row = next(i for i, cell in enumerate(cells) if not _is_number(cell))
+            row = next(i for i, cell in enumerate(cells) if "," in cell or not _is_number(cell))
             raise DataError(
                 f"{self.place(row)}: column {name!r} holds {cells[row]!r}; expected a number or "
                 "an empty cell"
@@ -122,12 +125,10 @@ def read_source(path: Path) -> Source:
 
 def _csv(path: Path) -> Source:
     """Read a text whose header is its first line of several words that are no numbers."""
-    data = path.read_bytes()
-    is_wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))  # a shell of Windows
-    text = data.decode("utf-16" if is_wide else "utf-8-sig", errors="replace")
-    if "\0" in text[:4096]:
-        raise DataError(f"{path.name}: expected a text of columns, got bytes that are none")
+    text = _text(path)
     lines = text.splitlines()
+    cut_off = "" if text.endswith(("\n", "\r")) else lines[-1].strip()
+    cut_off = "" if cut_off.startswith(_MARKS) else cut_off
     at, delimiter = _header(path, lines)
     if delimiter == _BLANK:
         lines = [line.strip() for line in lines]
@@ -148,8 +149,8 @@ def _csv(path: Path) -> Source:
         if not any(row) or row[0].startswith(_MARKS):
             continue
         if len(row) != len(names):
-            if number == len(lines) and not text.endswith("\n"):
-                continue  # cut by the end of a recording
+            if number == len(lines) and cut_off:
+                continue  # told below
             raise DataError(
                 f"{path.name}:{number}: {len(row)} cells, expected {len(names)} as in the header "
                 f"of line {at + 1}; correct or delete the line"
@@ -158,14 +159,46 @@ def _csv(path: Path) -> Source:
             rows, numbers = [], []
         rows.append(row)
         numbers.append(number)
+    notes: tuple[str, ...] = ()
+    if cut_off:
+        has_all = numbers[-1:] == [len(lines)]
+        if has_all and not is_cut_off(cut_off, lines[at + 1 : -1][-TAIL_LINES:], delimiter):
+            notes = (open_end(path.name),)
+        else:
+            notes = (f"{path.name}:{len(lines)}: the file ends within this line: left out",)
+            rows, numbers = rows[: len(rows) - has_all], numbers[: len(numbers) - has_all]
     if not rows:
-        raise DataError(f"{path.name}: a header and no rows; was the recording interrupted?")
+        raise _no_rows(path)
     columns = {
         name: [cell.strip() for cell in cells]
         for name, cells in zip(names, zip(*rows, strict=True), strict=True)
         if name
     }
-    return Source(path.name, columns, numbers, is_decimal_comma=delimiter == ";" and "," in text)
+    return Source(path.name, columns, numbers, delimiter != ",", notes)
+
+
+def _text(path: Path) -> str:
+    """Return the text of a file: UTF-16 with its mark, UTF-8, else the code page of Windows."""
+    data = path.read_bytes()
+    if not data.strip():
+        raise DataError(
+            f"{path.name}: the file is empty; expected a header row and one row per sample; was "
+            "the recording or the copy interrupted?"
+        )
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):  # a shell of Windows
+        text = data.decode("utf-16", errors="replace")
+    else:
+        try:
+            text = data.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            text = data.decode("cp1252", errors="replace")
+    if "\0" in text[:4096]:
+        raise DataError(f"{path.name}: expected a text of columns, got bytes that are none")
+    return text
+
+
+def _no_rows(path: Path) -> DataError:
+    return DataError(f"{path.name}: a header and no rows; was the recording interrupted?")
 
 
 def _header(path: Path, lines: list[str]) -> tuple[int, str]:
@@ -175,8 +208,10 @@ def _header(path: Path, lines: list[str]) -> tuple[int, str]:
         for delimiter in (*sorted(_DELIMITERS, key=line.count, reverse=True), _BLANK):
             between = None if delimiter == _BLANK else delimiter
             words = [word.strip() for word in line.strip("#%/ ").split(between)]
-            is_like = len(below.split(between)) == len(line.split(between))
-            if len(words) > 1 and is_like and not any(map(_is_number, words)):
+            is_header = len(words) > 1 and not any(map(_is_number, words))
+            if is_header and not below:
+                raise _no_rows(path)
+            if is_header and len(below.split(between)) == len(line.split(between)):
                 return at, delimiter
     raise DataError(
         f"{path.name}: no line of names above rows of numbers, with one of comma, semicolon, tab, "
@@ -186,9 +221,7 @@ def _header(path: Path, lines: list[str]) -> tuple[int, str]:
 
 def _is_of_units(first: list[str], second: list[str]) -> bool:
     """Return whether a row below the header names units, as the next one has numbers."""
-    counts = [
-        sum(_is_number(cell.strip().replace(",", ".")) for cell in row) for row in (first, second)
-    ]
+    counts = [sum(_is_number(cell.strip()) for cell in row) for row in (first, second)]
     return counts[0] == 0 and 2 * counts[1] > len(second) and all(cell.strip() for cell in first)
 
 
@@ -289,7 +322,7 @@ def _hdf5(path: Path) -> dict[str, Any]:
 
 def _is_number(cell: str) -> bool:
     try:
-        float(cell)
+        float(cell.replace(",", "."))
     except ValueError:
         return False
     return True

@@ -49,14 +49,19 @@ _FORMATS: Final = {
 FORMATS: Final = MappingProxyType({name: Format(*of) for name, of in _FORMATS.items()})
 
 
+def check_format(form: str) -> None:
+    """Raise :class:`ConfigError` for a format that is not known."""
+    if form not in FORMATS:
+        raise ConfigError(f"--format: {form!r} is not known, {nearest_hint(form, FORMATS)}")
+
+
 def export_track(track: Track, form: str, path: Path | str) -> list[Path]:
     """Write a track in a format; return the files, which take their places when all are whole.
 
     Raises :class:`ConfigError` for an unknown format, an epoch that is missing or a file over the
     result folder's own, :class:`DataError` where the disk refuses.
     """
-    if form not in FORMATS:
-        raise ConfigError(f"--format: {form!r} is not known, {nearest_hint(form, FORMATS)}")
+    check_format(form)
     path = Path(path)
     part = path.parent / f".part-{os.getpid()}"
     try:

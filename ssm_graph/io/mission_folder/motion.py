@@ -11,14 +11,17 @@ from itertools import permutations
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ssm_graph.base.earth import EARTH_RATE
 from ssm_graph.base.errors import DataError
 from ssm_graph.base.frozen import Array
+from ssm_graph.base.units import DEG_PER_H
 from ssm_graph.mission.mission import Mission
 from ssm_graph.sensors.depth import DepthLog
 from ssm_graph.sensors.dvl_readings import COUNTS
 from ssm_graph.sensors.gnss import GnssLog
+from ssm_graph.sensors.imu import ImuLog, ImuNoise, imu_gaps
 
 _UPWARD_M: Final = 2.0
 _WINDOW_S: Final = 2.0
@@ -212,17 +215,27 @@ def _turn_signs(mission: Mission, pings: tuple[Array, Array], label: str) -> lis
     before, after = force[:-1], force[1:]
     turn = _gained(mission, mission.imu.gyro_b, time_s, half)
     predicted, seen = -np.cross(turn, 0.5 * (before + after)), after - before
-    notes = []
+    notes, is_seen = [], _is_seen(imu, time_s, 2.0 * half)
+    if is_seen.sum() < _FEWEST_PINGS:
+        return []
     for axis, motion in enumerate(("pitches", "rolls")):
-        notes += _tilt_agrees(seen[:, axis], predicted[:, axis], f"{label}: the vehicle {motion}")
+        of_motion = f"{label}: the vehicle {motion}"
+        notes += _tilt_agrees(seen[is_seen, axis], predicted[is_seen, axis], of_motion)
     # What moves the vehicle is in the force as well, and turns with it: only gravity stays behind.
     ping_s, velocity = pings
     if len(ping_s) < _FEWEST_PINGS:
         return notes
     gravity = _gravity_direction(mission, edges, half, ping_s=ping_s, velocity=velocity)
     before, after = gravity[:-1], gravity[1:]
-    drift = (after - before + np.cross(turn, 0.5 * (before + after))).mean(axis=0)
+    drift = (after - before + np.cross(turn, 0.5 * (before + after)))[is_seen].mean(axis=0)
     return notes + _level_bias(mission, drift / (2.0 * half), label)
+
+
+def _is_seen(imu: ImuLog, time_s: Array, half: float) -> NDArray[np.bool_]:
+    """Return about which times (N,) no inertial samples are missing."""
+    begin_s, end_s = imu_gaps(imu)
+    before = (end_s[:, None] <= time_s - half) | (begin_s[:, None] >= time_s + half)
+    return np.asarray(before.all(axis=0))
 
 
 def _level_bias(mission: Mission, drift: Array, label: str) -> list[str]:
@@ -241,7 +254,7 @@ def _level_bias(mission: Mission, drift: Array, label: str) -> list[str]:
     return [
         f"{label}: over the mission the gyros turn by {_deg_per_h(bias)} deg/h about x, y, z more "
         "than the vehicle tilts, far beyond gyro_bias_deg_per_h = "
-        f"{_deg_per_h(noise.gyro_bias_sigma)}: that is a bias, and the axis along gravity, which "
+        f"{_stated(noise)}: that is a bias, and the axis along gravity, which "
         "this does not see, may have one too; take it off or state it"
     ]
 
@@ -267,7 +280,7 @@ def _rates_at_rest(mission: Mission, ping_s: Array, label: str) -> list[str]:
             return [
                 f"{label}: from {begin:z.1f} s on the vehicle lies still for {_REST_S:g} s by "
                 f"accelerometer and DVL, and the gyros read {_deg_per_h(mean)} deg/h about x, y, "
-                f"z; gyro_bias_deg_per_h = {_deg_per_h(noise.gyro_bias_sigma)}: a bias, or a "
+                f"z; gyro_bias_deg_per_h = {_stated(noise)}: a bias, or a "
                 "steady turn on the spot"
             ]
     return []
@@ -294,8 +307,12 @@ def _tilt_agrees(seen: Array, predicted: Array, subject: str) -> list[str]:
     return [text] if correlation < -0.5 else []
 
 
-def _deg_per_h(rate: Array | float) -> str:
-    return ", ".join(f"{x + 0.0:.0f}" for x in np.atleast_1d(np.degrees(rate) * 3600.0))
+def _stated(noise: ImuNoise) -> str:
+    return f"{noise.gyro_bias_sigma / DEG_PER_H:.3g}"
+
+
+def _deg_per_h(rate: Array) -> str:
+    return ", ".join(f"{x + 0.0:.0f}" for x in rate / DEG_PER_H)
 
 
 def _difference(time_s: Array, half: float, known_s: Array, values: Array) -> Array:

@@ -179,6 +179,16 @@ class MissionToml:
             found[name] = point(settings)
         return found
 
+    def point(self, name: str) -> Point:
+        """Return a point of the vehicle; raise :class:`ConfigError` for one that it has not."""
+        points = self.points()
+        if name not in points:
+            raise ConfigError(
+                f"--point: {name!r} is none of the vehicle, {nearest_hint(name, points)}; add "
+                f"[[point]] with name and lever_arm_m to {TOML_NAME}"
+            )
+        return points[name]
+
     def fault_of_no_place(self) -> ConfigError:
         """Return the error of a mission that may be anywhere on Earth."""
         return ConfigError(

@@ -30,7 +30,10 @@ _SIGNATURES = {
     b"PK\x03\x04": "a zip archive or a spreadsheet",
     b"\x1f\x8b": "gzip data",
 }
-_TAIL_LINES = 100
+TAIL_LINES = 100
+"""So many rows tell how long a row is."""
+_WITHIN_NUMBER = re.compile(r"(?:\d\.|\d[eE][+-]?|(?:^|[^\w-])[+-]?\.|[+-])$")
+"""At the end of a line."""
 _ROWS = 16384
 _SHOWN = 40
 
@@ -140,18 +143,34 @@ def check_last_line(file: CsvFile) -> str | None:
         tail = stream.read()
     if tail.endswith((b"\n", b"\r")):
         return None
-    *before, last = tail.splitlines()[-_TAIL_LINES - 1 :]
-    body = [len(line) for line in (before[1:] if len(before) < _TAIL_LINES else before)]
-    is_short = body and not last.endswith(b",") and len(last) < min(body) - 1
-    if is_short or last.endswith((b".", b"-", b"+", b"e")):
+    *before, last = tail.decode(errors="replace").splitlines()[-TAIL_LINES - 1 :]
+    if is_cut_off(last, before[1:] if len(before) < TAIL_LINES else before):
         with file.open() as stream:
             number = sum(1 for _ in stream)
         raise DataError(
             f"{file.label}:{number}: the last line is shorter than the others and has no newline; "
-            f"expected a complete row, got {_shown(last.decode(errors='replace'))}; the file was "
+            f"expected a complete row, got {_shown(last)}; the file was "
             "cut off: copy it again, or delete its last line"
         )
-    return f"{file.label}: the last line has no newline; if the file was cut off, it is incomplete"
+    return open_end(file.label)
+
+
+def is_cut_off(last: str, before: Sequence[str], delimiter: str = ",") -> bool:
+    """Return whether a last line without its newline plainly ends within a number.
+
+    Parameters
+    ----------
+    last : the line.
+    before : the rows above it.
+    delimiter : what stands between the cells.
+    """
+    is_short = before and not last.endswith(delimiter) and len(last) < min(map(len, before)) - 1
+    return bool(is_short or _WITHIN_NUMBER.search(last))
+
+
+def open_end(label: str) -> str:
+    """Return the note of a table whose last line has no newline, and may yet be whole."""
+    return f"{label}: the last line has no newline; if the file was cut off, it is incomplete"
 
 
 def write_csv(path: Path, columns: dict[str, Array]) -> None:

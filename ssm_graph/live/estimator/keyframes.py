@@ -22,10 +22,10 @@ from ssm_graph.graph.aids.aid import Aid, Keyframes
 from ssm_graph.graph.aids.depth import DepthMeans, Depths
 from ssm_graph.graph.aids.gnss import Fixes
 from ssm_graph.imu.ping_motion import PING_WINDOW_S, mean_gyro
-from ssm_graph.imu.preintegration import LIVELY_S, InertialChain, imu_gaps, preintegrate
+from ssm_graph.imu.preintegration import LIVELY_S, InertialChain, preintegrate
 from ssm_graph.live.estimator.buffers import OFF_WATER, Buffers, Logs, Measured
 from ssm_graph.mission.problem import Beams, ProblemConfig
-from ssm_graph.sensors.imu import ImuLog
+from ssm_graph.sensors.imu import ImuLog, imu_gaps
 from ssm_graph.smoothers.keyframe import Keyframe
 
 

@@ -127,7 +127,7 @@ def read_recorded(log: Path, options: NmeaOptions | None = None) -> Recorded | N
     else:
         return None
     if not found.messages:
-        said = "; ".join(found.notes) or "empty"
+        said = "; ".join(found.notes) or "the file ends within the first one"
         raise DataError(f"{log}: {found.about}, not one report that is read; {said}")
     pings = [message for message in found.messages if isinstance(message, Ping)]
     if pings and not any(math.isfinite(speed) for ping in pings for speed in ping.speed):

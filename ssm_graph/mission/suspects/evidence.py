@@ -131,7 +131,13 @@ class VelocityPart:
             return None
         edges = np.arange(pings.time_s[0], pings.time_s[-1] + WINDOW_S, WINDOW_S)
         cuts = np.searchsorted(pings.time_s, edges)
-        ranges = [(a, b) for a, b in pairwise(cuts.tolist()) if b - a >= FEWEST]
+        inertial_s = logs.inertial(NOTHING).time_s
+        n_inertial = np.diff(np.searchsorted(inertial_s, edges))
+        ranges = [
+            (a, b)
+            for (a, b), n in zip(pairwise(cuts.tolist()), n_inertial, strict=True)
+            if min(b - a, n) >= FEWEST
+        ]
         ranges = ranges[:: 1 + len(ranges) // MOST_WINDOWS]
         if not ranges:
             return None

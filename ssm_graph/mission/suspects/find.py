@@ -10,7 +10,6 @@ import numpy as np
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.progress import told
 from ssm_graph.base.times import is_inside
-from ssm_graph.imu.preintegration import imu_gaps
 from ssm_graph.mission.estimate import Estimate, Status
 from ssm_graph.mission.fault import DetectedFault, Treatment
 from ssm_graph.mission.mission import Mission
@@ -33,6 +32,7 @@ from ssm_graph.mission.suspects.search import (
     Family,
     Found,
 )
+from ssm_graph.sensors.imu import imu_gaps
 
 MOST: Final = 3
 """Suspects of one mission; with more, nothing is known."""
@@ -88,18 +88,18 @@ def _seen(mission: Mission) -> Mission:
     """Return the longest stretch of inertial data without a long gap, and the pings during it.
 
     How the vehicle turned in a gap nobody knows: what comes after it contradicts what was before.
+    Before the inertial data and after them it is the same, but for stamps that are off.
     """
     imu = mission.imu
     gap_s = np.stack(imu_gaps(imu))
     gap_s = gap_s[:, gap_s[1] - gap_s[0] > UNSEEN_S]
-    if gap_s.size == 0:
-        return mission
     begins_s, ends_s = np.append(imu.start_s, gap_s[1]), np.append(gap_s[0], imu.time_s[-1])
     longest = int(np.argmax(ends_s - begins_s))
     first_s, last_s = float(begins_s[longest]), float(ends_s[longest])
     own = (imu.time_s > first_s) & (imu.time_s <= last_s)
     rows = {name: getattr(imu, name)[own] for name in ("time_s", "gyro_b", "accel_b")}
-    dvl = mission.dvl.rows(is_inside(mission.dvl.valid_s, first_s, last_s))
+    off_s = 0.0 if gap_s.size else UNSEEN_S
+    dvl = mission.dvl.rows(is_inside(mission.dvl.valid_s, first_s - off_s, last_s + off_s))
     return replace(mission, imu=replace(imu, start_s=first_s, **rows), dvl=dvl)
 
 

@@ -14,7 +14,7 @@ from scipy.linalg import block_diag
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.stepwise import Steps
 from ssm_graph.engine.error_state import POSITION
-from ssm_graph.engine.evidence import ChainEvidence, Columns, Evidence
+from ssm_graph.engine.evidence import ChainEvidence, Columns, Evidence, root_of
 from ssm_graph.smoothers.faults.columns import IMU, Channels, Linear
 from ssm_graph.smoothers.faults.grid import Grid
 from ssm_graph.smoothers.faults.hypotheses import (
@@ -315,7 +315,7 @@ class Judged:
         flat = information.reshape(n * d, n * d) + np.diag(np.tile(1.0 / hypothesis.sigma**2, n))
         chi_sq = np.full((n + 1, n + 1), -np.inf)
         for begin in range(n):
-            root = np.linalg.cholesky(flat[begin * d :, begin * d :])
+            root = root_of(flat[begin * d :, begin * d :])
             half = np.linalg.solve(root, score[begin:].ravel())
             chi_sq[begin, begin + 1 :] = np.cumsum(np.sum(half.reshape(-1, d) ** 2, axis=1))
         count = np.maximum(np.arange(n + 1)[None, :] - np.arange(n + 1)[:, None], 0)

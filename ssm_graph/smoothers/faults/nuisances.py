@@ -16,7 +16,7 @@ from scipy.linalg import block_diag, solve_triangular
 
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.error_state import STATE_DIM
-from ssm_graph.engine.evidence import Columns, Evidence
+from ssm_graph.engine.evidence import Columns, Evidence, root_of
 from ssm_graph.graph.aids.depth import DEPTH_DRIFT, DepthMeans
 from ssm_graph.graph.aids.gnss import GNSS_DRIFT
 from ssm_graph.imu.increments import MergedSamples
@@ -261,7 +261,7 @@ class Priors:
 
         def likelihood(widths: tuple[float, ...]) -> float:
             if widths not in known:
-                root = np.linalg.cholesky(among + self.information(widths))
+                root = root_of(among + self.information(widths))
                 half = solve_triangular(root, score, lower=True, check_finite=False)
                 spread = 2.0 * float(np.sum(np.log(np.diagonal(root))))
                 known[widths] = 0.5 * (float(half @ half) - spread + self.log_det(widths))

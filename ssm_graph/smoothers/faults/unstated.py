@@ -20,6 +20,7 @@ from ssm_graph.base.frames import MATRIX_PLACES
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.units import DEG_PER_H, MICRO_G
 from ssm_graph.engine.error_state import ACCEL_BIAS, GYRO_BIAS
+from ssm_graph.engine.evidence import root_of
 from ssm_graph.imu.preintegration import InertialChain
 from ssm_graph.mission.fault import DetectedFault, Treatment
 from ssm_graph.sensors.imu import OF_INSTABILITY
@@ -171,7 +172,7 @@ class _Test:
         mean, spread = float(np.trace(share)), float(np.sqrt(2.0 * np.sum(share * share.T)))
         likely = []
         for scale in SCALES:
-            root = np.linalg.cholesky(seen + known / scale**2)
+            root = root_of(seen + known / scale**2)
             half = np.linalg.solve(root, left)
             size = np.sum(np.log(np.diagonal(root))) + len(own) * np.log(scale)
             likely.append(0.5 * float(half @ half) - float(size))

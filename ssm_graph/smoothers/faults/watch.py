@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -32,9 +32,10 @@ from ssm_graph.smoothers.faults.columns import (
     linear_of_steps,
 )
 from ssm_graph.smoothers.faults.freeing import columns_of, freed_of, inside_of
-from ssm_graph.smoothers.faults.hypotheses import Course
+from ssm_graph.smoothers.faults.hypotheses import Course, chi_sq_at
 from ssm_graph.smoothers.faults.judged import Fault, Judge
 from ssm_graph.smoothers.faults.nuisances import Nuisances
+from ssm_graph.smoothers.faults.of_start import without_start
 from ssm_graph.smoothers.faults.pieces import PieceSearch
 from ssm_graph.smoothers.faults.search import Beside, FaultSearch, with_rivals
 from ssm_graph.smoothers.faults.unstated import Unstated
@@ -45,6 +46,11 @@ SLOW: Final = 0.7
 """Of the update before, from which on a pass hardly comes nearer, and"""
 SLOW_PASSES: Final = 3
 """how many such passes in a row are waited for."""
+
+
+CHANCE: Final = 1e-3
+"""Probability of what is left of a fault by chance once the start is hardly known."""
+LOOK_AT_START: Final = "look at the start, [initial] where it is stated"
 
 
 class Changed(NamedTuple):
@@ -257,7 +263,9 @@ class FaultWatch:
                 aids_out[name] |= inside_of(channels.aid_keyframe[name], fault)
         self.aids_out = np.concatenate([np.zeros(0, bool), *aids_out.values()])
 
-    def faults(self, states: States, inertial: InertialFit) -> tuple[DetectedFault, ...]:
+    def faults(
+        self, states: States, step: ChainSolution, inertial: InertialFit
+    ) -> tuple[DetectedFault, ...]:
         """Return what was found, with the sizes that the answer gives it, and what is left over."""
         if self._search is None:
             return ()
@@ -292,6 +300,7 @@ class FaultWatch:
                     late_s=late_of(fault),
                 )
             )
+        found = [*self._or_the_start(found, states, step)]
         if self._unstated is not None:
             end = len(states.constants) - len(self._possible)
             errors = states.constants[end - len(self._unstated.errors_sigma) : end]
@@ -314,6 +323,23 @@ class FaultWatch:
             replace(one, remedy="; ".join([*lines, one.remedy])) for one in self._contradicted
         ]
         return (*found, *(left or before))
+
+    def _or_the_start(
+        self, said: Sequence[DetectedFault], states: States, step: ChainSolution
+    ) -> Iterator[DetectedFault]:
+        """Yield what is said, with the start as a rival where it alone speaks for a fault."""
+        prior, first = GraphLinearizer(self._problem).prior, self._problem.extras.n_constants
+        for fault, one in itertools.zip_longest(self._found, said):
+            end = first + (sum(f.n_constants for f in with_rivals([fault])) if fault else 0)
+            at, first = slice(first, end), end
+            if at.start == at.stop or fault.is_allowed_for:
+                yield one
+                continue
+            left = without_start(prior, states, step, at)
+            if left.chi_sq < chi_sq_at(CHANCE, at.stop - at.start):
+                rivals = (*one.rivals, f"the start: {left.off}")
+                one = replace(one, rivals=rivals, remedy=LOOK_AT_START)
+            yield one
 
 
 def let_back(found: list[Fault]) -> list[Fault]:
