@@ -103,22 +103,28 @@ def test_what_may_be_chance_acts_on_the_rows_in_force(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize(
-    ("first", "second", "chosen"),
+    ("first", "second", "merit", "chosen"),
     [
-        ((BEAM, Course.ANYTHING), (BEAM, Course.CONSTANT), 0),
-        ((IMU, Course.CONSTANT), (BEAM, Course.CONSTANT), 1),
-        ((IMU, Course.CONSTANT), (BEAM, Course.ANYTHING), 0),
+        ((BEAM, Course.ANYTHING), (BEAM, Course.CONSTANT), 890.0, 0),
+        ((IMU, Course.CONSTANT), (BEAM, Course.CONSTANT), 600.0, 1),
+        ((IMU, Course.CONSTANT), (BEAM, Course.ANYTHING), 600.0, 0),
+        (("GNSS", Course.ANYTHING), (BEAM, Course.CONSTANT), 890.0, 1),
+        (("GNSS", Course.ANYTHING), (BEAM, Course.CONSTANT), 800.0, 0),
+        (("GNSS", Course.ANYTHING), (IMU, Course.CONSTANT), 890.0, 0),
     ],
 )
 def test_inertial_data_are_chosen_last(
-    first: tuple[str, Course], second: tuple[str, Course], chosen: int
+    first: tuple[str, Course], second: tuple[str, Course], merit: float, chosen: int
 ) -> None:
-    """But before readings that would have to be anything; what explains most is chosen else."""
+    """But before readings that would have to be anything; what explains most is chosen else.
+
+    A few numbers of another sensor that explain nearly as much come before such readings.
+    """
     ranked = [
         Candidate(
-            Hypothesis("any", channel, np.eye(1), np.ones(1), str, course), 0, 1, 1e3, merit, 0.0
+            Hypothesis("any", channel, np.eye(1), np.ones(1), str, course), 0, 1, 1e3, own, 0.0
         )
-        for (channel, course), merit in zip((first, second), (900.0, 600.0), strict=True)
+        for (channel, course), own in zip((first, second), (900.0, merit), strict=True)
     ]
     assert chosen_of(ranked) is ranked[chosen]
 

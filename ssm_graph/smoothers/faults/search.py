@@ -43,6 +43,9 @@ JOLT = 22.0
 in 400 places is above it once in 50 missions."""
 INERTIAL_SHARE = 0.5
 """Of the merit of an inertial fault, from which on another sensor's is taken instead."""
+ANYTHING_SHARE = 0.95
+"""Of the merit of readings that may be anything, from which on a few numbers of another sensor are
+taken instead. Far from an answer that many explain a little more of all that is wrong there."""
 SAME_ONSET = 4.0
 """Chi-square by which another onset of a ramp may be worse, two sigmas, and is freed, too."""
 POSSIBLE = 11.0
@@ -315,29 +318,37 @@ def fault_of(candidate: Candidate, judged: Judged) -> Fault:
 def chosen_of(ranked: Sequence[Candidate]) -> Candidate | None:
     """Return what is to be freed, None if nothing is significant; inertial data come last.
 
-    Biases over stretches explain a part of anything. But what even readings that may be anything
-    explain less well is their fault.
+    Biases over stretches explain a part of anything, as readings do that may be anything. But what
+    even such readings explain less well is the inertial data's fault.
     """
     significant = [one for one in ranked if one.is_significant]
     if not significant:
         return None
     best = significant[0]
-    if best.hypothesis.channel != IMU:
+    is_anything = best.hypothesis.course is Course.ANYTHING
+    if best.hypothesis.channel != IMU and not is_anything:
         return best
+    share = ANYTHING_SHARE if is_anything else INERTIAL_SHARE
     others = (
         one
         for one in significant
-        if one.hypothesis.channel != IMU and one.hypothesis.course is not Course.ANYTHING
+        if one.hypothesis.channel not in (IMU, best.hypothesis.channel)
+        and one.hypothesis.course is not Course.ANYTHING
     )
     other = next(others, best)
-    return other if other.merit > INERTIAL_SHARE * best.merit else best
+    return other if other.merit > share * best.merit else best
 
 
 def rivals_of(
     best: Fault, ranked: Sequence[Candidate], judged: Judged, *, margin: float
 ) -> list[Fault]:
     """Return other sensors, and other stretches, that explain the data as well."""
-    found = [fault_of(one, judged) for one in ranked if one.merit > best.merit - margin]
+    found = [
+        fault_of(one, judged)
+        for one in ranked
+        if one.merit > best.merit - margin
+        and not (one.merit > best.merit and one.hypothesis.course is Course.ANYTHING)
+    ]
     elsewhere = judged.best_of([best.hypothesis], apart_from=best)[0]
     if elsewhere.merit > best.merit - margin:
         found.append(fault_of(elsewhere, judged))

@@ -328,7 +328,8 @@ class FaultWatch:
         self, said: Sequence[DetectedFault], states: States, step: ChainSolution
     ) -> Iterator[DetectedFault]:
         """Yield what is said, with the start as a rival where it alone speaks for a fault."""
-        prior, first = GraphLinearizer(self._problem).prior, self._problem.extras.n_constants
+        assert self._bare is not None
+        prior, first = self._bare.prior, self._problem.extras.n_constants
         for fault, one in itertools.zip_longest(self._found, said):
             end = first + (sum(f.n_constants for f in with_rivals([fault])) if fault else 0)
             at, first = slice(first, end), end

@@ -17,6 +17,9 @@ Mask = NDArray[np.bool_]
 
 SQUARE_OF_3_SIGMA: Final = 14.16
 """Quantile of 0.9973 of chi-square with three degrees of freedom."""
+LONG_OF_HALF: Final = 0.8
+"""Share of the ranges of one half that may be too long; bursts that take 40 % of all may take so
+much of it. Without a limit a half says nothing against an answer that fits none of it."""
 
 
 def contradictions(
@@ -44,6 +47,15 @@ def contradictions(
     )  # fmt: skip
     first = at.time_s < np.median(at.time_s)
     halves = [polished(_part(problem, half), best) for half in (first, ~first)]
+    for which, half in zip(("first", "second"), halves, strict=True):
+        own = first if which == "first" else ~first
+        shares = long_shares(len(names), at.anchor[own], half.error, at.sigma_m[own])
+        told += [
+            f"{100.0 * share:.0f} % of the ranges to anchor {name} in the {which} half are too "
+            "long: are all of them of this anchor?"
+            for name, share in zip(names, shares, strict=True)
+            if share > LONG_OF_HALF
+        ]
     apart = np.log(halves[0].scale / halves[1].scale)
     sigma = float(np.hypot(halves[0].sigma_log_scale, halves[1].sigma_log_scale))
     if abs(apart) > 3.0 * sigma:
@@ -60,6 +72,13 @@ def contradictions(
                 "second half: did it move, or is the antenna not calibrated?"
             )
     return told
+
+
+def long_shares(n: int, anchor: Indices, error: Array, sigma_m: Array) -> list[float]:
+    """Return which share of the ranges (M,) to each of n anchors is too long, 0 without ranges."""
+    shares = np.broadcast_to(sight_kernel(error, sigma_m, anchor).share, error.shape)
+    own = [shares[anchor == j] for j in range(n)]
+    return [float(one[0]) if len(one) else 0.0 for one in own]
 
 
 def misfits(
@@ -82,7 +101,7 @@ def misfits(
     stated_m, rms_sigmas, long_share : as in :func:`contradictions`.
     """
     told = []
-    shares = np.broadcast_to(sight_kernel(error, sigma_m, anchor).share, error.shape)
+    shares = long_shares(len(names), anchor, error, sigma_m)
     for j, name in enumerate(names):
         own = anchor == j
         stated, seen = float(np.median(stated_m[own])), robust_rms(error[own])
@@ -90,9 +109,8 @@ def misfits(
             told.append(f"residuals of anchor {name} are {seen:.2f} m, {stated:.2f} m were stated")
         if abs(biases[j]) > 3.0 * BIAS_M:
             told.append(f"the bias of anchor {name} would be {biases[j]:.2f} m")
-        share = float(np.median(shares[own]))
-        if share > long_share:
-            told.append(f"{100.0 * share:.0f} % of the ranges to anchor {name} are too long")
+        if shares[j] > long_share:
+            told.append(f"{100.0 * shares[j]:.0f} % of the ranges to anchor {name} are too long")
     return told
 
 
