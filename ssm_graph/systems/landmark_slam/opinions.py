@@ -82,7 +82,7 @@ MOST_SWEEPS: Final = 3
 MOST_ROUNDS: Final = 30
 """Of mergers."""
 MOST_IMPROVED: Final = 3
-"""Opinions, the cheapest ones."""
+"""Opinions whose stretches are tied anew, the cheapest ones."""
 
 
 class Opinion(NamedTuple):
@@ -128,11 +128,12 @@ def best_opinion(
         drawn = pair_by_particles(short, its_noise, drift, seed=seed)
         if len(drawn.values.landmarks):
             found.append(judge.begun(drawn.landmark, drawn.values, False))
-    found.sort(key=lambda one: one.cost)
-    cheapest = found[0]
-    for number, one in enumerate(found[:MOST_IMPROVED]):
-        if one.cost - cheapest.cost <= SURE * _noise(one, cheapest):
-            found[number] = judge.improved(one)
+    for improved, most in ((judge.simplified, len(found)), (judge.improved, MOST_IMPROVED)):
+        found.sort(key=lambda one: one.cost)
+        cheapest = found[0]
+        for number, one in enumerate(found[:most]):
+            if one.cost - cheapest.cost <= SURE * _noise(one, cheapest):
+                found[number] = improved(one)
     best = min(found, key=lambda one: one.cost)
     pose = problem.expanded(best.values.pose, kept)
     apart = [problem.expanded(one.values.pose, kept) - pose for one in found]
@@ -158,9 +159,16 @@ class _Judge:
             opinion = self._all_merged(self._paired(opinion, True), True)
         return self._all_merged(self._paired(opinion, False), False)
 
+    def simplified(self, opinion: Opinion) -> Opinion:
+        """Return what comes of one opinion with fewer landmarks."""
+        for times in BLURS:
+            new = self._coarser(opinion, times)
+            opinion = new if is_better(new, opinion) else opinion
+        return opinion
+
     def improved(self, opinion: Opinion) -> Opinion:
         """Return what comes of one opinion with fewer landmarks and stretches tied anew."""
-        steps = [partial(self._simplified, times=times) for times in BLURS]
+        steps = [partial(self._coarser, times=times) for times in BLURS]
         steps += [partial(self._closed_anew, rows=rows) for rows in self._stretches()]
         unchanged = 0
         for step in MOST_SWEEPS * steps:
@@ -191,7 +199,7 @@ class _Judge:
         opened = self._all_merged(self._judged(landmark, begin), True)
         return self._all_merged(self._paired(opened, False), False)
 
-    def _simplified(self, opinion: Opinion, times: float) -> Opinion:
+    def _coarser(self, opinion: Opinion, times: float) -> Opinion:
         """Return an opinion of a coarser map.
 
         With sigmas so many ``times`` as large what stands close together is one; then, along the
