@@ -268,7 +268,7 @@ def test_simulated_and_found(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     """A room rendered, written, read and solved: metres to 2 % and to 3 cm, by the commands."""
     run, out = str(tmp_path / "run"), str(tmp_path / "out")
     simulated = ["visual-simulate", "room", "--small", "--seed", "2", "--anchors", "3"]
-    fewer = ["--duration-s", "12", "--rate-hz", "8"]
+    fewer = ["--duration-s", "14", "--rate-hz", "8"]
     assert main([*simulated, *fewer, "--out", run]) == 0
     assert main(["visual", run, "--corners", "250", "--no-loops", "--out", out]) == 0
     assert "against the truth" in capsys.readouterr().out
