@@ -46,9 +46,9 @@ def contradictions(
         stated_m=stated_m, rms_sigmas=rms_sigmas, long_share=long_share,
     )  # fmt: skip
     first = at.time_s < np.median(at.time_s)
-    halves = [polished(_part(problem, half), best) for half in (first, ~first)]
-    for which, half in zip(("first", "second"), halves, strict=True):
-        own = first if which == "first" else ~first
+    own_of = {"first": first, "second": ~first}
+    halves = [polished(_part(problem, own), best) for own in own_of.values()]
+    for (which, own), half in zip(own_of.items(), halves, strict=True):
         shares = long_shares(len(names), at.anchor[own], half.error, at.sigma_m[own])
         told += [
             f"{100.0 * share:.0f} % of the ranges to anchor {name} in the {which} half are too "
