@@ -8,6 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from ssm_graph.base.frozen import Array
+from ssm_graph.io.mission_folder.vehicle import vehicle_of
+from ssm_graph.io.raw_log.rows import messages_of
 from ssm_graph.live.estimator import FixedLagSmoother
 from ssm_graph.live.estimator.watch import Watch
 from ssm_graph.mission.navigation import Health
@@ -15,6 +17,8 @@ from ssm_graph.sensors.depth import DepthReading
 from ssm_graph.sensors.gnss import Fix
 from ssm_graph.sensors.imu import ImuSample
 from ssm_graph.sensors.messages import Message
+from ssm_graph.simulation import DvlSettings, Fault, FaultShape, Sensor, with_faults
+from tests.helpers import simulated
 from tests.online_fixture import SHORT, messages, stream
 
 FROM_S, TO_S = 2.0, 18.0
@@ -64,7 +68,7 @@ def test_false_depths_that_fixes_contradict_are_not_followed() -> None:
     newest = smoother.newest()
     assert newest is not None
     assert newest.health is Health.DEGRADED
-    assert "contradict the depth" in newest.reason
+    assert "depth contradicts the prediction" in newest.reason
     assert "recovered" not in {event.kind for event in smoother.take_events()}
 
 
@@ -103,3 +107,21 @@ def test_a_height_that_only_fixes_know_follows_them_and_nothing_else_does() -> N
     assert watch.moved == ()
     assert watch.contradicted is not None
     assert [event.kind for event in smoother.take_events()].count("recovered") == 1
+
+
+def test_a_frozen_depth_does_not_pull_at_the_height_wherever_a_wave_brings_it_past() -> None:
+    """It agrees there for a moment, twice in every wave; the answer is never far off and GOOD."""
+    sim = simulated(duration_s=90.0, dvl=DvlSettings(noise=0.005), seed=5)
+    frozen = Fault(sensor=Sensor.DEPTH, shape=FaultShape.STUCK, start_s=20.0, end_s=70.0)
+    mission = with_faults(sim.mission, (frozen,), truth=sim.truth_at, seed=5).mission
+    smoother = FixedLagSmoother(vehicle_of(mission))
+    off = []
+    for message in messages_of(mission):
+        smoother.push(message)
+        newest = smoother.newest() if isinstance(message, DepthReading) else None
+        if newest is not None:
+            height = float(sim.truth_at(np.array([newest.time_s])).height[0])
+            off.append(abs(newest.height - height) / newest.position_sigma_enu[2])
+    assert max(off) < 5.0
+    told = [event.text for event in smoother.take_events()]
+    assert any("left out until it agrees" in text for text in told)

@@ -15,6 +15,7 @@ import numpy as np
 
 from ssm_graph.base.errors import SolverError
 from ssm_graph.engine.error_state import VELOCITY
+from ssm_graph.graph.aids.depth import DepthMeans
 from ssm_graph.live.estimator.buffers import Buffers, Measured
 from ssm_graph.live.estimator.guard import Guard, Guarded, Guardian, protection_at
 from ssm_graph.live.estimator.keyframes import KeyframeMaker
@@ -171,18 +172,17 @@ class Course:
         sigma = last.window.newest_sigma
         if len(keyframe.beams) == 0 and np.linalg.norm(sigma[VELOCITY]) > ANY_SPEED:
             keyframe = keyframe.no_faster_than(ANY_SPEED)
-        window = last.window.successor()
-        reserve = last.reserve.led_on(keyframe, window.inertial)
+        reserve = last.reserve.led_on(keyframe, last.window.inertial)
         doubt = doubt_of(last.watch, sigma, keyframe)
         if doubt is not None:
             return self._anew(keyframe, doubt, reserve)
         try:
-            left = window.advance(keyframe)
-            window.iterate()
-            window.require_sane()
+            window, left = _advanced(last.window, keyframe)
+            watch = self._observed(keyframe, window, parity=self._agree(measured))
+            if watch.leaves_depth_out and DepthMeans.name in keyframe.aids:
+                window, left = _advanced(last.window, keyframe.without(DepthMeans.name))
         except (SolverError, np.linalg.LinAlgError, FloatingPointError) as error:
             return self._anew(keyframe, Doubt(Doubted.ANSWER, str(error)), reserve)
-        watch = self._observed(keyframe, window, parity=self._agree(measured))
         if is_sound(watch, keyframe.time_s):
             reserve = reserve.renewed(window)
         if watch.trouble_s == keyframe.time_s and watch.trouble != last.watch.trouble:
@@ -249,3 +249,12 @@ class Course:
         newest, buffers = measured.pings[-1], self._buffers
         parity = buffers.vehicle.mount.parity(newest[buffers.speeds], newest[buffers.sigmas])
         return bool(parity < 5.0)
+
+
+def _advanced(window: Window, keyframe: Keyframe) -> tuple[Window, Stretch | None]:
+    """Return the window at the next keyframe, settled, and what has left it."""
+    window = window.successor()
+    left = window.advance(keyframe)
+    window.iterate()
+    window.require_sane()
+    return window, left

@@ -43,6 +43,13 @@ FEW: Final = 0.5
 GAP_S: Final = 0.3
 """So long without an inertial sample leaves an attitude that the next pings have to confirm."""
 SILENT_IMU_S: Final = 1.0
+DOUBTED_DEPTH: Final = 0.5
+"""A depth of which more was refused lately is left out altogether: one that is frozen agrees twice
+in every wave, and each time would pull the height a little to where it stays."""
+TRUSTED_DEPTH: Final = 0.25
+"""Until less of it is refused: some 10 s in which it agrees."""
+DEPTHS_S: Final = 1.0
+"""A depth counts in that mean for the time since the one before, but for so long at most."""
 
 
 class Contradicted(NamedTuple):
@@ -83,6 +90,12 @@ class Watch(NamedTuple):
     depths_refused: int = 0
     depths_followed: bool = False
     """Whether the height was begun anew where these put it"""
+    depth_heard_s: float = -math.inf
+    """When a depth came last, whether it counted or not, s"""
+    refused_depth: float = 0.0
+    """Running mean of the share of depths that are refused"""
+    leaves_depth_out: bool = False
+    """Whether none counts, since too many were"""
     last_height_s: float = -math.inf
     """When the height of a fix counted last, s"""
     last_depth_s: float = -math.inf
@@ -178,10 +191,16 @@ def _with_heights(watch: Watch, keyframe: Keyframe, newest: Stretch) -> Watch:
             )
     if DepthMeans.name in keyframe.aids:
         is_refused = _is_refused(newest, DepthMeans.name)
+        share = -math.expm1(-min(time_s - watch.depth_heard_s, DEPTHS_S) / MEMORY_S)
+        refused = watch.refused_depth + share * (is_refused - watch.refused_depth)
+        is_out = refused > (TRUSTED_DEPTH if watch.leaves_depth_out else DOUBTED_DEPTH)
         watch = watch._replace(
             depths_refused=watch.depths_refused + 1 if is_refused else 0,
             depths_followed=watch.depths_followed and is_refused,
-            last_depth_s=watch.last_depth_s if is_refused else time_s,
+            depth_heard_s=time_s,
+            refused_depth=refused,
+            leaves_depth_out=is_out,
+            last_depth_s=watch.last_depth_s if is_refused or is_out else time_s,
         )
     return watch
 
@@ -276,8 +295,10 @@ def _trouble(watch: Watch, time_s: float, v_n: Array) -> str:
             f"the height of {watch.heights_refused} GNSS fixes in a row contradicts the prediction "
             "and is left out"
         )
+    if watch.leaves_depth_out:
+        return "the depth contradicts the prediction again and again: left out until it agrees"
     if watch.depths_refused:
-        return f"{watch.depths_refused} keyframes in a row contradict the depth"
+        return f"the depth contradicts the prediction, {watch.depths_refused} times in a row"
     if watch.misfit > MISFIT:
         return f"the beams that count miss the answer by {math.sqrt(watch.misfit):.1f} sigmas"
     if watch.good_share < FEW and time_s - watch.last_beam_s < LOCK_LOST_S:
