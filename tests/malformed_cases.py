@@ -267,6 +267,10 @@ TABLE_CASES = cases(
             cell("imu.csv", 17, "gyro_x_rad_per_s", "abc"),
             "imu.csv:17 | 'gyro_x_rad_per_s' holds 'abc' | expected a number",
         ),
+        "A word for a missing beam": (
+            cell("dvl.csv", 9, "beam2_m_per_s", "N/A"),
+            "dvl.csv:9 | 'beam2_m_per_s' holds 'N/A' | leave the cell of a missing reading empty",
+        ),
         "An empty cell where a number is needed": (
             cell("depth.csv", 9, "depth_m", ""),
             "depth.csv:9 | 'depth_m' is empty | expected a number",

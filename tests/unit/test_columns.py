@@ -390,7 +390,8 @@ def _broken(path: Path, line: int, change: Callable[[str], str]) -> None:
 @pytest.mark.parametrize(
     ("file", "change", "told"),
     [
-        ("imu.csv", lambda s: s.replace(s.split(",")[1], "n/a"), "imu.csv:7: column 'gx' holds 'n"),
+        ("imu.csv", lambda s: s.replace(s.split(",")[1], "bad"), "imu.csv:7: column 'gx' holds 'b"),
+        ("imu.csv", lambda s: s.replace(s.split(",")[1], "n/a"), r"imu.csv:7: .*\('gx' of imu.csv"),
         ("imu.csv", lambda s: s + ",1", "imu.csv:7: 8 cells, expected 7"),
         ("imu.csv", lambda s: "0.0" + s[s.index(",") :], "imu.csv:7: time_s goes back"),
         ("imu.csv", lambda s: s.rsplit(",", 1)[0] + ",", r"imu.csv:7: .*\('az' of imu.csv\)"),
@@ -526,6 +527,14 @@ def test_tables_of_other_loggers(tmp_path: Path) -> None:
     path.write_text("t\tp\n0.5\t1,000\n1.0\t999.5\n")
     with pytest.raises(DataError, match=r"other.csv:2: column 'p' holds '1,000'"):
         read_source(path).numbers("p", "x")
+
+
+def test_words_for_a_missing_reading_are_empty_cells(tmp_path: Path) -> None:
+    """Whatever a logger calls it."""
+    path = tmp_path / "log.csv"
+    path.write_text("t,p\n1.0,NULL\n2.0,n/a\n3.0,-\n4.0,\n5.0,-7\n")
+    found = read_source(path).numbers("p", "x")
+    np.testing.assert_array_equal(found, [np.nan, np.nan, np.nan, np.nan, -7.0])
 
 
 @pytest.mark.parametrize("end", ["", "3.0", "3.0,", "3.0,7", "3.0,7.12345e-", "3.0,-"])

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ssm_graph.base.errors import DataError, MissingExtraError, nearest_hint
 from ssm_graph.base.progress import told
 from ssm_graph.io.file_kind import CSV_ENDINGS
-from ssm_graph.io.tables.csv_tables import TAIL_LINES, is_cut_off, open_end
+from ssm_graph.io.tables.csv_tables import MISSING, TAIL_LINES, is_cut_off, open_end
 from ssm_graph.io.tables.files import pyarrow_module
 
 _HDF5: Final = (".h5", ".hdf5", ".nc")
@@ -69,7 +69,10 @@ class Source:
         return self.columns[name]
 
     def numbers(self, name: str, asked: str) -> NDArray[np.float64]:
-        """Return a column as numbers (N,), NaN for an empty cell; raise for a cell that is none."""
+        """Return a column as numbers (N,), NaN for an empty cell; raise for a cell that is none.
+
+        Words for a reading that is missing, such as NULL or N/A, count as empty cells.
+        """
         cells = self.column(name, asked)
         if not isinstance(cells, list):
             if cells.dtype.kind not in "biuf":
@@ -80,7 +83,7 @@ class Source:
             return np.asarray(cells, np.float64)
         if self.has_decimal_commas and not any("." in cell for cell in cells):
             cells = [cell.replace(",", ".") for cell in cells]
-        words = {"": "nan", "true": "1", "false": "0"}
+        words = {"": "nan", "true": "1", "false": "0"} | dict.fromkeys(MISSING, "nan")
         cells = [words.get(cell.lower(), cell) for cell in cells]
         try:
             return np.array(cells, np.float64)

@@ -34,6 +34,8 @@ TAIL_LINES = 100
 """So many rows tell how long a row is."""
 _WITHIN_NUMBER = re.compile(r"(?:\d\.|\d[eE][+-]?|(?:^|[^\w-])[+-]?\.|[+-])$")
 """At the end of a line."""
+MISSING = frozenset({"null", "n/a", "na", "#n/a", "<na>", "none", "nil", "-", "--"})
+"""What loggers write for a reading that is missing, in small letters"""
 _ROWS = 16384
 _SHOWN = 40
 
@@ -218,6 +220,8 @@ def _number(cell: str, place: str, name: str, *, blank: frozenset[str]) -> float
     hint = "correct the number, or delete this row"
     if cell.startswith(("'", '"')):
         hint = "write numbers without quotes"
+    elif cell.lower() in MISSING and name in blank:
+        hint = "leave the cell of a missing reading empty"
     raise DataError(f"{place}: column {name!r} {got}; expected a number; {hint}")
 
 
