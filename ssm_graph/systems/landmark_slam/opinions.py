@@ -3,7 +3,8 @@
 A filter that goes along cannot take back what it paired wrongly, and a little more or less trust in
 the observations leads it elsewhere. So it goes along several times; one time it remembers no
 landmark for long, so that it closes nothing, and what is met again stands in the map anew. And
-particles go along, which pair in many ways at once (`particles`). Then, with the whole log
+particles go along, which pair in many ways at once (`particles`), and again with the drift of the
+odometry that the best opinion yet tells, for as long as that finds a better one. Then, with the whole log
 smoothed, scans are paired anew along the path (`reassociation`), and landmarks that may be one by
 their joint covariance are taken as one (`merging`), where that costs less: where it bends the
 odometry less and explains more, with fewer landmarks, and with fewer that are in view and not seen
@@ -15,6 +16,7 @@ is sure.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Final, NamedTuple
@@ -56,6 +58,9 @@ TRUSTS: Final = ((1.0, 1.0), (1.5, 1.0), (1.0, 1.5))
 """By which the sigmas of ranges and bearings are multiplied while a first opinion is formed."""
 SWARMS: Final = 4
 """Of particles: each of them ends with one pairing, and by chance another."""
+MOST_GENERATIONS: Final = 5
+"""Of swarms. A better pairing tells better how the odometry drifts, and with that particles find a
+better one still; so it goes on until a generation finds none."""
 SIGMA_OF_MEDIAN: Final = 1.4826
 """A Gaussian's standard deviation over its median absolute value."""
 ALIKE: Final = 0.3
@@ -120,21 +125,22 @@ def best_opinion(
     for trust in TRUSTS:
         wider = SlamNoise(noise.control, noise.observation * trust)
         firsts.append((associate(problem, wider, how), False))
-    found = [
+    new = [
         judge.begun(first.landmark, Values(first.pose[kept], first.places), is_open)
         for first, is_open in firsts
     ]
-    for seed in range(SWARMS):
-        drawn = pair_by_particles(short, its_noise, drift, seed=seed)
-        if len(drawn.values.landmarks):
-            found.append(judge.begun(drawn.landmark, drawn.values, False))
-    for improved, most in ((judge.simplified, len(found)), (judge.improved, MOST_IMPROVED)):
-        found.sort(key=lambda one: one.cost)
-        cheapest = found[0]
-        for number, one in enumerate(found[:most]):
-            if one.cost - cheapest.cost <= SURE * _noise(one, cheapest):
-                found[number] = improved(one)
-    best = min(found, key=lambda one: one.cost)
+    found: list[Opinion] = []
+    for generation in range(MOST_GENERATIONS):
+        for seed in range(SWARMS):
+            drawn = pair_by_particles(short, its_noise, drift, seed=generation * SWARMS + seed)
+            if len(drawn.values.landmarks):
+                new.append(judge.begun(drawn.landmark, drawn.values, False))
+        was, found, new = found, judge.mended(new, found, judge.simplified), []
+        if was and found[0] is was[0]:
+            break
+        drift = found[0].values.drift
+    found = judge.mended(found[:MOST_IMPROVED], found[MOST_IMPROVED:], judge.improved)
+    best = found[0]
     pose = problem.expanded(best.values.pose, kept)
     apart = [problem.expanded(one.values.pose, kept) - pose for one in found]
     return best._replace(
@@ -158,6 +164,17 @@ class _Judge:
         if is_open:  # where the path is wrong yet, what is met again is not known
             opinion = self._all_merged(self._paired(opinion, True), True)
         return self._all_merged(self._paired(opinion, False), False)
+
+    def mended(
+        self, new: list[Opinion], others: list[Opinion], better: Callable[[Opinion], Opinion]
+    ) -> list[Opinion]:
+        """Return all opinions, the cheapest first; new ones that are as good are made better."""
+        new = sorted(new, key=lambda one: one.cost)
+        cheapest = min([*new, *others], key=lambda one: one.cost)
+        for number, one in enumerate(new):
+            if one.cost - cheapest.cost <= SURE * _noise(one, cheapest):
+                new[number] = better(one)
+        return sorted([*new, *others], key=lambda one: one.cost)
 
     def simplified(self, opinion: Opinion) -> Opinion:
         """Return what comes of one opinion with fewer landmarks."""
