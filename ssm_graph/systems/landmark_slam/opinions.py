@@ -4,9 +4,9 @@ A filter that goes along cannot take back what it paired wrongly, and a little m
 the observations leads it elsewhere. So it goes along several times; one time it remembers no
 landmark for long, so that it closes nothing, and what is met again stands in the map anew. And
 particles go along, which pair in many ways at once (`particles`), and again with the drift of the
-odometry that the best opinion yet tells, for as long as that finds a better one. Then, with the whole log
-smoothed, scans are paired anew along the path (`reassociation`), and landmarks that may be one by
-their joint covariance are taken as one (`merging`), where that costs less: where it bends the
+odometry that the best opinion yet tells, for as long as that finds a better one. With all of the
+log smoothed, scans are paired anew along the path (`reassociation`), and landmarks that may be one
+by their joint covariance are taken as one (`merging`), where that costs less: where it bends the
 odometry less and explains more, with fewer landmarks, and with fewer that are in view and not seen
 (`sight`). All opinions have one noise, so that their costs compare. Of the cheapest, and of those
 that cannot be told from it, the map is then made simpler, and stretches are tied to the rest anew,
