@@ -70,9 +70,6 @@ no lane begun since tells one that noise has made from one that stays small. The
 falsely suspected at tactical grade takes a lane minutes to find again."""
 AT_EASE: Final = 0.05
 """It agrees where noise alone would part it by more in so many cases."""
-RIGHT: Final = 0.5
-"""And where it shows that the answer is off by less than this share of what it was: one that was
-begun anew may lie between the truth and what a sensor says."""
 DOUBTED_S: Final = 30.0
 """So long after an answer was begun anew a lane from before contradicts at `DOUBTFUL`."""
 DOUBTFUL: Final = 1e-3
@@ -295,7 +292,7 @@ class Judge:
             return None
         is_out = bool(found.test[own[0]].max() < self._at_ease)
         if was.is_certain:
-            is_out &= bool(found.size[own] + self._side * found.sigma[own] <= RIGHT * was.size)
+            is_out &= bool(found.size[own] + self._side * found.sigma[own] <= was.size)
             if self._bank.suspects[was.suspect] == DVL and was.part == 0:
                 is_out |= self._is_confirmed(was, lanes, found, time_s)
         agreed_s = min(was.agreed_s, time_s) if is_out else np.inf
