@@ -183,6 +183,7 @@ def watch_after(was: Watch, begun: Window, last: Stretch, doubt: Doubt) -> Watch
         depths_refused=was.depths_refused,
         depths_followed=was.depths_followed or doubt.what is Doubted.HEIGHT,
         depth_heard_s=was.depth_heard_s,
+        depth_refused_s=was.depth_refused_s,
         refused_depth=was.refused_depth if doubt.what is not Doubted.HEIGHT else 0.0,
         leaves_depth_out=was.leaves_depth_out and doubt.what is not Doubted.HEIGHT,
         last_height_s=was.last_height_s,

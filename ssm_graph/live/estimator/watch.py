@@ -44,10 +44,9 @@ GAP_S: Final = 0.3
 """So long without an inertial sample leaves an attitude that the next pings have to confirm."""
 SILENT_IMU_S: Final = 1.0
 DOUBTED_DEPTH: Final = 0.5
-"""A depth of which more was refused lately is left out altogether: one that is frozen agrees twice
-in every wave, and each time would pull the height a little to where it stays."""
-TRUSTED_DEPTH: Final = 0.25
-"""Until less of it is refused: some 10 s in which it agrees."""
+"""A depth of which more was refused lately is left out altogether, until it has agreed for
+`PROBATION_S`: one that is frozen agrees twice in every wave, and each time would pull the height a
+little to where it stays."""
 DEPTHS_S: Final = 1.0
 """A depth counts in that mean for the time since the one before, but for so long at most."""
 
@@ -92,6 +91,8 @@ class Watch(NamedTuple):
     """Whether the height was begun anew where these put it"""
     depth_heard_s: float = -math.inf
     """When a depth came last, whether it counted or not, s"""
+    depth_refused_s: float = -math.inf
+    """When one was refused last, s"""
     refused_depth: float = 0.0
     """Running mean of the share of depths that are refused"""
     leaves_depth_out: bool = False
@@ -193,11 +194,15 @@ def _with_heights(watch: Watch, keyframe: Keyframe, newest: Stretch) -> Watch:
         is_refused = _is_refused(newest, DepthMeans.name)
         share = -math.expm1(-min(time_s - watch.depth_heard_s, DEPTHS_S) / MEMORY_S)
         refused = watch.refused_depth + share * (is_refused - watch.refused_depth)
-        is_out = refused > (TRUSTED_DEPTH if watch.leaves_depth_out else DOUBTED_DEPTH)
+        refused_s = time_s if is_refused else watch.depth_refused_s
+        if watch.leaves_depth_out and time_s - refused_s > PROBATION_S:
+            refused = 0.0
+        is_out = refused > DOUBTED_DEPTH or (watch.leaves_depth_out and refused > 0.0)
         watch = watch._replace(
             depths_refused=watch.depths_refused + 1 if is_refused else 0,
             depths_followed=watch.depths_followed and is_refused,
             depth_heard_s=time_s,
+            depth_refused_s=refused_s,
             refused_depth=refused,
             leaves_depth_out=is_out,
             last_depth_s=watch.last_depth_s if is_refused or is_out else time_s,
@@ -295,7 +300,7 @@ def _trouble(watch: Watch, time_s: float, v_n: Array) -> str:
             f"the height of {watch.heights_refused} GNSS fixes in a row contradicts the prediction "
             "and is left out"
         )
-    if watch.leaves_depth_out:
+    if watch.depths_refused and watch.leaves_depth_out:
         return "the depth contradicts the prediction again and again: left out until it agrees"
     if watch.depths_refused:
         return f"the depth contradicts the prediction, {watch.depths_refused} times in a row"
