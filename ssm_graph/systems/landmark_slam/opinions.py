@@ -58,9 +58,9 @@ TRUSTS: Final = ((1.0, 1.0), (1.5, 1.0), (1.0, 1.5))
 """By which the sigmas of ranges and bearings are multiplied while a first opinion is formed."""
 SWARMS: Final = 4
 """Of particles: each of them ends with one pairing, and by chance another."""
-MOST_GENERATIONS: Final = 5
+MOST_GENERATIONS: Final = 6
 """Of swarms. A better pairing tells better how the odometry drifts, and with that particles find a
-better one still; so it goes on until a generation finds none."""
+better one still; so it goes on until neither a generation nor what is improved then is better."""
 SIGMA_OF_MEDIAN: Final = 1.4826
 """A Gaussian's standard deviation over its median absolute value."""
 ALIKE: Final = 0.3
@@ -86,7 +86,7 @@ MOST_SWEEPS: Final = 3
 """Over all stretches, each tied to the rest anew."""
 MOST_ROUNDS: Final = 30
 """Of mergers."""
-MOST_IMPROVED: Final = 3
+MOST_IMPROVED: Final = 4
 """Opinions whose stretches are tied anew, the cheapest ones."""
 
 
@@ -136,10 +136,11 @@ def best_opinion(
             if len(drawn.values.landmarks):
                 new.append(judge.begun(drawn.landmark, drawn.values, False))
         was, found, new = found, judge.mended(new, found, judge.simplified), []
-        if was and found[0] is was[0]:
-            break
+        if _is_same(found, was) or generation == MOST_GENERATIONS - 1:
+            found = judge.mended(found[:MOST_IMPROVED], found[MOST_IMPROVED:], judge.improved)
+            if _is_same(found, was):
+                break
         drift = found[0].values.drift
-    found = judge.mended(found[:MOST_IMPROVED], found[MOST_IMPROVED:], judge.improved)
     best = found[0]
     pose = problem.expanded(best.values.pose, kept)
     apart = [problem.expanded(one.values.pose, kept) - pose for one in found]
@@ -148,6 +149,11 @@ def best_opinion(
         values=best.values._replace(pose=pose),
         elsewhere_m=np.linalg.norm(np.array(apart)[..., :2], axis=2).max(axis=0),
     )
+
+
+def _is_same(found: list[Opinion], was: list[Opinion]) -> bool:
+    """Return whether the cheapest opinion is the one that it was."""
+    return bool(was) and found[0] is was[0]
 
 
 class _Judge:
