@@ -184,8 +184,6 @@ def victoria(folder: Path) -> Iterator[str]:
     rows = []
     for source in (folder / "gtsam_victoria_park.txt", folder):
         for method in ("smoother", "ekf-weighted", *INCREMENTAL):
-            if source == folder and method in INCREMENTAL:
-                continue
             note(f"{source.name}, {method}")
             began = time.process_time()
             solved = solve_input(source, Asked(method))
