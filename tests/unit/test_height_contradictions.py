@@ -110,7 +110,7 @@ def test_a_height_that_only_fixes_know_follows_them_and_nothing_else_does() -> N
 
 
 def test_a_frozen_depth_does_not_pull_at_the_height_wherever_a_wave_brings_it_past() -> None:
-    """It agrees there for a moment, twice in every wave; the answer is never far off and GOOD."""
+    """It agrees there for a moment, twice in every wave; the height is never beyond 5 sigma."""
     sim = simulated(duration_s=90.0, dvl=DvlSettings(noise=0.005), seed=5)
     frozen = Fault(sensor=Sensor.DEPTH, shape=FaultShape.STUCK, start_s=20.0, end_s=70.0)
     mission = with_faults(sim.mission, (frozen,), truth=sim.truth_at, seed=5).mission

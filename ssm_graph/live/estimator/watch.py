@@ -196,8 +196,9 @@ def _with_heights(watch: Watch, keyframe: Keyframe, newest: Stretch) -> Watch:
         refused = watch.refused_depth + share * (is_refused - watch.refused_depth)
         refused_s = time_s if is_refused else watch.depth_refused_s
         if watch.leaves_depth_out and time_s - refused_s > PROBATION_S:
-            refused = 0.0
-        is_out = refused > DOUBTED_DEPTH or (watch.leaves_depth_out and refused > 0.0)
+            is_out, refused = False, 0.0
+        else:
+            is_out = watch.leaves_depth_out or refused > DOUBTED_DEPTH
         watch = watch._replace(
             depths_refused=watch.depths_refused + 1 if is_refused else 0,
             depths_followed=watch.depths_followed and is_refused,

@@ -291,11 +291,9 @@ class _Judge:
     def _merged(self, opinion: Opinion, is_open: bool) -> Opinion | None:
         """Return an opinion that takes landmarks as one and costs less, or None."""
         places, L = opinion.values.landmarks, len(opinion.values.landmarks)
-        seen = np.zeros(
-            (len(self._problem.time_s), L)
-        )  # a product of integers takes 20 times as long
+        seen = np.zeros((len(self._problem.time_s), L))
         seen[opinion.problem.keyframe, opinion.problem.landmark] = 1.0
-        together = (seen.T @ seen).astype(np.intp)
+        together = (seen.T @ seen).astype(np.intp)  # of integers it takes 20 times as long
         now = Map(places, DOUBT**2 * opinion.cov, together, np.arange(L))
         per_m2 = density(places)
         single = [one.map for one in mergers(now, per_m2)[:MOST_TRIED]]
