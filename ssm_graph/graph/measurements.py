@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.similarity import Kernel, LogKernel, Similarity
-from ssm_graph.base import chi2
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.extras import Extras
 from ssm_graph.engine.reweighting import Lengths, TailSchedule
@@ -22,7 +21,14 @@ from ssm_graph.graph.aids.aid import Aid, Linearised, RowStates
 from ssm_graph.graph.aids.depth import DepthMeans
 from ssm_graph.graph.aids.gnss import Fixes
 from ssm_graph.graph.freed import Freed
-from ssm_graph.mission.answer import LOW_WEIGHT, MISFIT, SUSPECT_SHARE, TRUSTED
+from ssm_graph.mission.answer import (
+    LOW_WEIGHT,
+    MISFIT,
+    SLOW_SIGMAS,
+    SUSPECT_SHARE,
+    TRUSTED,
+    doubt_of_run,
+)
 from ssm_graph.mission.estimate import AidTable
 from ssm_graph.mission.problem import Problem
 
@@ -235,19 +241,6 @@ def aid_table(judged: Sequence[JudgedAid]) -> AidTable | None:
     )
 
 
-RUN = 20
-"""Successive depths, or position fixes, that are looked at together."""
-SHORTEST_RUN = 8
-"""Of fewer nothing is said."""
-SLOW_SIGMAS = 6.0
-"""So long the median has to be where a search has looked for what lasts: the rest is swell and
-multipath, which are nobody's fault."""
-RUN_TAIL = 0.03
-"""Share of Gaussian errors that are longer than the median of a run may be: three times the sigma
-of one component, twice that of three. Half of a run has to be that long, which has a chance of
-1e-10 for twenty and 6e-5 for eight; as many may be gross and say nothing."""
-
-
 def doubts_of_aids(judged: Sequence[JudgedAid], *, is_searched: bool = False) -> list[str]:
     """Say in a sentence each which aid disagrees with the answer.
 
@@ -266,7 +259,10 @@ def _doubt(one: JudgedAid, least_sigmas: float) -> str:
             f"the answer (weight below {LOW_WEIGHT}): {aid.hint}"
         )
     if isinstance(aid, DepthMeans | Fixes):
-        return _doubt_run(one, least_sigmas)
+        whitened_sq = np.sum(one.error**2, axis=1)
+        return doubt_of_run(
+            type(aid), one.time_s, whitened_sq, dim=aid.dim, least_sigmas=least_sigmas
+        )
     trusted = np.mean(one.error**2, axis=1)[weights >= TRUSTED]
     misfit = float(np.mean(trusted)) if len(trusted) else 0.0
     if misfit <= MISFIT:
@@ -274,22 +270,4 @@ def _doubt(one: JudgedAid, least_sigmas: float) -> str:
     return (
         f"{aid.name} measurements that count miss the answer by {np.sqrt(misfit):.1f} of their "
         f"own sigmas (rms): their noise is stated too small, or {aid.hint}"
-    )
-
-
-def _doubt_run(one: JudgedAid, least_sigmas: float) -> str:
-    """Look for successive measurements of place that miss the answer together."""
-    aid, size = one.aid, min(RUN, len(one.weight))
-    if size < SHORTEST_RUN:
-        return ""
-    runs = np.lib.stride_tricks.sliding_window_view(np.sum(one.error**2, axis=1), size)
-    median = np.median(runs, axis=1)
-    worst = int(np.argmax(median))
-    sigmas = np.sqrt(median[worst] / chi2.ppf(0.5, aid.dim))
-    if median[worst] <= chi2.isf(RUN_TAIL, aid.dim) or sigmas < least_sigmas:
-        return ""
-    return (
-        f"{aid.name} measurements from {one.time_s[worst]:.1f} s to "
-        f"{one.time_s[worst + size - 1]:.1f} s miss the answer by "
-        f"{sigmas:.1f} of their own sigmas (median): their noise is stated too small, or {aid.hint}"
     )

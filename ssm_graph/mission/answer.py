@@ -9,11 +9,13 @@ import numpy as np
 
 from factors.dvl_beam import beam_residual
 from factors.inertial import MovingState
+from ssm_graph.base import chi2
 from ssm_graph.base.earth import LocalFrame
 from ssm_graph.base.frames import phi_D_roll_pitch_heading, roll_pitch_heading_from_R_lb
 from ssm_graph.base.frozen import Array
 from ssm_graph.base.runs import runs_of
 from ssm_graph.engine.error_state import POSITION, ROTATION, VELOCITY
+from ssm_graph.graph.aids.aid import Aid
 from ssm_graph.mission.calibration import taken_as_exact
 from ssm_graph.mission.estimate import BeamTable, Estimate, Status, Trajectory
 from ssm_graph.mission.problem import Problem
@@ -156,6 +158,47 @@ def _doubt_stretches(problem: Problem, weights: Array) -> str:
     return (
         f"most beams of every ping contradict the answer from {begin_s[longest]:.1f} s to "
         f"{end_s[longest]:.1f} s: look at the DVL's bottom lock and the inertial data there"
+    )
+
+
+RUN = 20
+"""Successive depths, or position fixes, that are looked at together."""
+SHORTEST_RUN = 8
+"""Of fewer nothing is said."""
+SLOW_SIGMAS = 6.0
+"""So long the median has to be where a search has looked for what lasts: the rest is swell and
+multipath, which are nobody's fault."""
+RUN_TAIL = 0.03
+"""Share of Gaussian errors that are longer than the median of a run may be: three times the sigma
+of one component, twice that of three. Half of a run has to be that long, which has a chance of
+1e-10 for twenty and 6e-5 for eight; as many may be gross and say nothing."""
+
+
+def doubt_of_run(
+    aid: type[Aid], time_s: Array, whitened_sq: Array, *, dim: int, least_sigmas: float = 0.0
+) -> str:
+    """Say whether successive measurements of place miss the answer together; empty if not.
+
+    Parameters
+    ----------
+    aid : what measured.
+    time_s : (M,) when, s.
+    whitened_sq : (M,) squared length of what each misses, in its own sigmas.
+    dim : of a measurement.
+    least_sigmas : the median of a run below which it is nobody's fault.
+    """
+    size = min(RUN, len(time_s))
+    if size < SHORTEST_RUN:
+        return ""
+    median = np.median(np.lib.stride_tricks.sliding_window_view(whitened_sq, size), axis=1)
+    worst = int(np.argmax(median))
+    sigmas = np.sqrt(median[worst] / chi2.ppf(0.5, dim))
+    if median[worst] <= chi2.isf(RUN_TAIL, dim) or sigmas < least_sigmas:
+        return ""
+    return (
+        f"{aid.name} measurements from {time_s[worst]:.1f} s to {time_s[worst + size - 1]:.1f} s "
+        f"miss the answer by {sigmas:.1f} of their own sigmas (median): their noise is stated too "
+        f"small, or {aid.hint}"
     )
 
 

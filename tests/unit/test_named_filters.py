@@ -14,9 +14,10 @@ from ssm_graph.base.errors import ConfigError
 from ssm_graph.base.frozen import Array
 from ssm_graph.filters.navigation.named import FILTERS, filter_problems
 from ssm_graph.mission.estimate import OUTLIER_WEIGHT, Estimate, Status, Trajectory
+from ssm_graph.mission.mission import InitialState
 from ssm_graph.mission.problem import Problem, build_problem
-from ssm_graph.simulation import OutlierKind, Outliers, SimulatedMission
-from tests.helpers import simulated
+from ssm_graph.simulation import GnssSettings, OutlierKind, Outliers, SimulatedMission
+from tests.helpers import simulated, with_initial
 
 every_filter = pytest.mark.parametrize("name", FILTERS)
 BY_PARAMETER = [name for name, choice in FILTERS.items() if choice.default is not None]
@@ -83,6 +84,20 @@ def test_every_filter_converges_on_clean_data(name: str) -> None:
         assert weight.max() <= highest_weight(name)
         assert np.median(weight) > 0.9
         assert estimate.method == f"filter {name}"
+
+
+@pytest.mark.parametrize("name", ["ekf", "ekf-gate-beam", "ssm-log"])
+def test_a_start_whose_heading_is_wrong_is_no_converged_answer(name: str) -> None:
+    """Beams alone tell little of it; fixes that lie aside of the way do, one after the other."""
+    sim = simulated(duration_s=60.0, gnss=GnssSettings(windows=((0.0, 60.0),)))
+    start = sim.mission.initial
+    assert isinstance(start, InitialState)
+    off = with_initial(sim.mission, heading=start.heading + np.radians(10.0))
+    for mission, status in ((sim.mission, Status.CONVERGED), (off, Status.SUSPECT)):
+        (estimate,) = filter_problems([build_problem(mission)], name)
+        assert estimate.status is status, estimate.reason
+    assert "GNSS measurements" in estimate.reason
+    assert "start" in estimate.reason
 
 
 @pytest.mark.parametrize("name", STEADY)

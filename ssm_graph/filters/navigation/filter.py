@@ -37,7 +37,7 @@ from ssm_graph.graph.aids.aid import Aid
 from ssm_graph.graph.aids.depth import DepthMeans
 from ssm_graph.graph.aids.gnss import EAST_NORTH_UP, Fixes
 from ssm_graph.imu.preintegration import gravity_gradient, gtsam_gravity
-from ssm_graph.mission.answer import RecursiveBeams, recursive_estimate
+from ssm_graph.mission.answer import RecursiveBeams, doubt_of_run, recursive_estimate
 from ssm_graph.mission.estimate import AidTable, Estimate, OnKeyframe
 from ssm_graph.mission.problem import Problem, start_of
 
@@ -285,20 +285,37 @@ def estimates_from_history(
             method=method,
             kernel=kernel,
             wall_s=wall_s,
+            doubts=_doubts_of_places(problem, history, run),
         )
         estimates.append(replace(estimate, aids=_aid_table(problem, history, run)))
     return estimates
+
+
+PLACES: dict[type[Aid], tuple[str, ...]] = {DepthMeans: (DepthMeans.name,), Fixes: EAST_NORTH_UP}
+"""What a filter takes beside beams, in the order of its history, and the components of each."""
+
+
+def _doubts_of_places(problem: Problem, history: FilterHistory, run: int) -> list[str]:
+    """Look for depths and fixes that are far from their predictions one after the other.
+
+    The beams tell little of a start whose heading is wrong: the vehicle goes where they say.
+    """
+    whitened_sq = history.aid_mahalanobis_sq[:, run].T
+    at = [np.flatnonzero(np.isfinite(own)) for own in whitened_sq]
+    doubts = [
+        doubt_of_run(aid, problem.keyframe_s[k], own[k], dim=len(labels))
+        for (aid, labels), own, k in zip(PLACES.items(), whitened_sq, at, strict=True)
+    ]
+    return [f"{doubt}; or the start is wrong, above all its heading" for doubt in doubts if doubt]
 
 
 def _aid_table(problem: Problem, history: FilterHistory, run: int) -> AidTable | None:
     """Return what became of depths and fixes in one run; None if it has none."""
     innovation = history.aid_innovation[:, run]
     parts = []
-    kinds: tuple[tuple[type[Aid], int], ...] = ((DepthMeans, 0), (Fixes, 1))
-    for i, (aid, first) in enumerate(kinds):
+    for i, (aid, labels) in enumerate(PLACES.items()):
         weight = history.aid_weight[:, run, i]
         k = np.flatnonzero(np.isfinite(weight))
-        labels = EAST_NORTH_UP if aid is Fixes else (aid.name,)
         size = len(labels)
         parts.append(
             AidTable(
@@ -306,7 +323,7 @@ def _aid_table(problem: Problem, history: FilterHistory, run: int) -> AidTable |
                 component=labels * len(k),
                 unit=(aid.unit,) * (size * len(k)),
                 time_s=np.repeat(problem.keyframe_s[k], size),
-                innovation=innovation[k, first : first + size].ravel(),
+                innovation=innovation[k, i : i + size].ravel(),
                 mahalanobis_sq=np.repeat(history.aid_mahalanobis_sq[k, run, i], size),
                 weight=np.repeat(weight[k], size),
             )
