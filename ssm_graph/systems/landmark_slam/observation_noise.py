@@ -95,7 +95,7 @@ def learn_observations(
 
     The noise of the motion stays as stated; observations that are too few keep what was stated.
     """
-    how = settings or SmootherSettings()
+    how = replace(settings or SmootherSettings(), finds_tail=False)
     given = stated.observation * problem.scales
     there = np.isfinite(problem.measured)
     ranges = np.where(there[:, 0], problem.measured[:, 0], 0.0)

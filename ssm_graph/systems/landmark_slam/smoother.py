@@ -8,7 +8,7 @@ miss, residual and posterior variance, and noise is learnt from the same numbers
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -18,6 +18,7 @@ from factors.similarity import GaussianKernel, Kernel, LogKernel
 from ssm_graph.base.errors import SolverError
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.chain import Chain, ChainSolution
+from ssm_graph.engine.reweighting import MOST_TAILS, NEAR_SIGMAS, Lengths
 from ssm_graph.systems.landmark_slam.models import between, turned
 from ssm_graph.systems.landmark_slam.problem import (
     SlamEstimate,
@@ -25,7 +26,7 @@ from ssm_graph.systems.landmark_slam.problem import (
     SlamProblem,
     SlamStatus,
 )
-from ssm_graph.systems.landmark_slam.weights import weights_of
+from ssm_graph.systems.landmark_slam.weights import tail_of, weights_of
 
 RIGID: Final = 1e-4
 """m and rad: noise of an increment in directions that the motion's noise does not reach."""
@@ -45,6 +46,9 @@ class SmootherSettings:
 
     kernel: Kernel = LogKernel(5.0)
     """Weighs the observations."""
+    finds_tail: bool = True
+    """Whether the logarithm's kernel gets the degrees of freedom that the observations ask for, at
+    least its own; of sigmas that are wider than single errors they tell nothing."""
     odometry_kernel: Kernel = GaussianKernel()
     """Weighs the increments of odometry, each as a whole."""
     max_iterations: int = 50
@@ -194,6 +198,12 @@ class Pass(NamedTuple):
     update_sigmas: float
     weight_change: float
 
+    @property
+    def lengths(self) -> Lengths:
+        """Of its observations."""
+        square = self.expected.own.sum(axis=1)
+        return Lengths(square, square - np.square(self.rows.own_error).sum(axis=1))
+
 
 def one_pass(
     problem: SlamProblem,
@@ -273,7 +283,9 @@ def smooth_landmarks(
     short, its_noise, kept = problem.condensed(noise)
     if short is not problem:  # most of the way with fewer poses
         begin = values._replace(pose=values.pose[kept])
-        found, _, _ = _settled(short, its_noise, how, begin, w, limit=ROUGH)
+        found, _, _ = _settled(
+            short, its_noise, replace(how, finds_tail=False), begin, w, limit=ROUGH
+        )
         values = found.values._replace(pose=problem.expanded(found.values.pose, kept))
         w = found.weights
     found, is_settled, count = _settled(problem, noise, how, values, w)
@@ -294,11 +306,18 @@ def _settled(
 ) -> tuple[Pass, bool, int]:
     """Return the last pass, whether it settled, and how many there were."""
     step_w, is_settled, count = np.ones(len(problem.control)), False, 0
-    change = np.zeros(len(w))
+    change, heaviest, tails = np.zeros(len(w)), how.kernel, 0
     while not is_settled and count < how.max_iterations:
         found = one_pass(problem, noise, how, values, w, step_w)
-        before, change = change, found.weights - w
         values, step_w, count = found.values, found.step_weights, count + 1
+        if how.finds_tail and tails < MOST_TAILS and found.update_sigmas < NEAR_SIGMAS:
+            kernel = tail_of(heaviest, found.lengths, w, found.rows.n_rows)
+            if kernel != how.kernel:
+                how, tails = replace(how, kernel=kernel), tails + 1
+                w = weights_of(kernel, found.lengths.square, found.rows.n_rows)
+                change = np.zeros(len(w))
+                continue
+        before, change = change, found.weights - w
         w = found.weights if found.update_sigmas > 1.0 else _ahead(found.weights, before, change)
         is_settled = found.update_sigmas < limit * SETTLED
         is_settled &= found.weight_change < limit * SETTLED_WEIGHT

@@ -15,8 +15,10 @@ import numpy as np
 from scipy.optimize import brentq
 
 from factors.similarity import GaussianKernel, Kernel
+from factors.tails import likeliest_tail, tails_of
 from ssm_graph.base import chi2
 from ssm_graph.base.frozen import Array
+from ssm_graph.engine.reweighting import Lengths
 
 _QUANTILES: Final = (np.arange(4000) + 0.5) / 4000.0
 
@@ -52,3 +54,28 @@ def weights_of(kernel: Kernel, t: Array, dim: Array) -> Array:
         of_size = dim == size
         weights[of_size] = kernel.weight(t[of_size] / c, dim=size) / c
     return weights
+
+
+def tail_of(kernel: Kernel, lengths: Lengths, weights: Array, dim: Array) -> Kernel:
+    """Return the kernel with the tail that makes measurements likeliest, see `factors.tails`.
+
+    Those that err less than stated hide their tail: they count as if their median were as stated.
+
+    Parameters
+    ----------
+    kernel : with the heaviest tail that they may have.
+    lengths : of M measurements.
+    weights : (M,)
+    dim : (M,) of their rows; of those without any nothing is asked.
+    """
+    tails = tails_of(kernel)
+    evidence, largest = np.zeros(len(tails)), int(np.max(dim, initial=1))
+    for size in range(1, largest + 1):
+        own = dim == size
+        if not own.any():
+            continue
+        square = lengths.square[own]
+        square *= max(chi2.ppf(0.5, size) / float(np.median(square)), 1.0)
+        part = Lengths(square, lengths.spread[own])
+        evidence += part.evidence(tails, weights[own], dim=size)
+    return likeliest_tail(tails, evidence, dim=largest)

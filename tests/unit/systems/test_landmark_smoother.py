@@ -149,6 +149,23 @@ def smoothed(problem: SlamProblem, first: Values, kernel: Kernel) -> SlamEstimat
     return smooth_landmarks(problem, NOISE, first, SmootherSettings(kernel))
 
 
+def test_sound_observations_do_not_pay_for_gross_ones() -> None:
+    """A light tail is found where nothing is gross; a few gross ones call the heavy one back."""
+    problem, truth = small(np.random.default_rng(3), n_poses=400)
+    measured = problem.measured.copy()
+    measured[::20, 0] += 3.0
+    spoilt = replace(problem, measured=measured)
+    heavy = SmootherSettings(finds_tail=False)
+
+    def away(log: SlamProblem, settings: SmootherSettings | None) -> float:
+        found = smooth_landmarks(log, NOISE, truth, settings)
+        return float(np.linalg.norm(found.pose[:, :2] - sound.pose[:, :2]))
+
+    sound = smooth_landmarks(problem, NOISE, truth, SmootherSettings(GaussianKernel()))
+    assert away(problem, None) < 0.25 * away(problem, heavy)
+    assert away(spoilt, None) == away(spoilt, heavy)
+
+
 def test_gross_observations_lose_their_weight() -> None:
     """A third of them anywhere, and the answer hardly moves; least squares is led astray."""
     rng = np.random.default_rng(3)
