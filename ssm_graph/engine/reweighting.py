@@ -280,8 +280,11 @@ class Lengths(NamedTuple):
 
         By its weight each counts for the share of its length that the answer leaves it.
         """
-        telling = np.clip(1.0 - weights * self.spread / dim, 0.0, 1.0)
-        return tail_evidence(tails, self.square, telling, dim=dim)
+        return tail_evidence(tails, self.square, self.telling(weights, dim=dim), dim=dim)
+
+    def telling(self, weights: Array, *, dim: int) -> Array:
+        """Return the share (M,) of its length that the answer leaves each by its weight."""
+        return np.clip(1.0 - weights * self.spread / dim, 0.0, 1.0)
 
 
 @final

@@ -47,8 +47,8 @@ class SmootherSettings:
     kernel: Kernel = LogKernel(5.0)
     """Weighs the observations."""
     finds_tail: bool = True
-    """Whether the logarithm's kernel gets the degrees of freedom that the observations ask for, at
-    least its own; of sigmas that are wider than single errors they tell nothing."""
+    """Whether the logarithm's kernel gets the tail that the observations ask for, see `tail_of`; of
+    sigmas that are wider than single errors they tell nothing."""
     odometry_kernel: Kernel = GaussianKernel()
     """Weighs the increments of odometry, each as a whole."""
     max_iterations: int = 50
@@ -280,48 +280,57 @@ def smooth_landmarks(
     how = settings or SmootherSettings()
     values = with_drift(problem, first)
     w = np.ones(len(problem.keyframe)) if weights is None else weights
+    kernel = how.kernel
     short, its_noise, kept = problem.condensed(noise)
     if short is not problem:  # most of the way with fewer poses
         begin = values._replace(pose=values.pose[kept])
-        found, _, _ = _settled(
-            short, its_noise, replace(how, finds_tail=False), begin, w, limit=ROUGH
-        )
+        near = _settled(short, its_noise, how, kernel, begin, w, limit=ROUGH)
+        found, kernel = near.last, near.kernel
         values = found.values._replace(pose=problem.expanded(found.values.pose, kept))
         w = found.weights
-    found, is_settled, count = _settled(problem, noise, how, values, w)
-    if not np.all(np.isfinite(found.values.pose)):
+    end = _settled(problem, noise, how, kernel, values, w)
+    if not np.all(np.isfinite(end.last.values.pose)):
         raise SolverError("smooth_landmarks: no finite solution; look at sigmas and first values")
-    status = SlamStatus.CONVERGED if is_settled else SlamStatus.MAX_ITERATIONS
-    return estimate_of(problem, noise, found, status, count)
+    status = SlamStatus.CONVERGED if end.is_settled else SlamStatus.MAX_ITERATIONS
+    return estimate_of(problem, noise, end.last, status, end.n_passes)
+
+
+class _Settled(NamedTuple):
+    last: Pass
+    kernel: Kernel
+    """In force at the end"""
+    is_settled: bool
+    n_passes: int
 
 
 def _settled(
     problem: SlamProblem,
     noise: SlamNoise,
     how: SmootherSettings,
+    kernel: Kernel,
     values: Values,
     w: Array,
     *,
     limit: float = 1.0,
-) -> tuple[Pass, bool, int]:
-    """Return the last pass, whether it settled, and how many there were."""
+) -> _Settled:
+    """Return where passes lead that begin with a kernel and weights (M,)."""
     step_w, is_settled, count = np.ones(len(problem.control)), False, 0
-    change, heaviest, tails = np.zeros(len(w)), how.kernel, 0
+    change, tails = np.zeros(len(w)), 0
     while not is_settled and count < how.max_iterations:
-        found = one_pass(problem, noise, how, values, w, step_w)
+        found = one_pass(problem, noise, replace(how, kernel=kernel), values, w, step_w)
         values, step_w, count = found.values, found.step_weights, count + 1
         if how.finds_tail and tails < MOST_TAILS and found.update_sigmas < NEAR_SIGMAS:
-            kernel = tail_of(heaviest, found.lengths, w, found.rows.n_rows)
-            if kernel != how.kernel:
-                how, tails = replace(how, kernel=kernel), tails + 1
-                w = weights_of(kernel, found.lengths.square, found.rows.n_rows)
-                change = np.zeros(len(w))
+            n_rows = found.rows.n_rows
+            asked = tail_of(how.kernel, found.lengths, w, n_rows)
+            if asked != kernel:
+                kernel, tails, change = asked, tails + 1, np.zeros(len(w))
+                w = weights_of(kernel, found.lengths.square, n_rows)
                 continue
         before, change = change, found.weights - w
         w = found.weights if found.update_sigmas > 1.0 else _ahead(found.weights, before, change)
         is_settled = found.update_sigmas < limit * SETTLED
         is_settled &= found.weight_change < limit * SETTLED_WEIGHT
-    return found, is_settled, count
+    return _Settled(found, kernel, is_settled, count)
 
 
 def _ahead(weights: Array, before: Array, change: Array) -> Array:

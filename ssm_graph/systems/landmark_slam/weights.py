@@ -14,12 +14,17 @@ from typing import Final
 import numpy as np
 from scipy.optimize import brentq
 
+from factors.mixture import likeliest_mixture
 from factors.similarity import GaussianKernel, Kernel
-from factors.tails import likeliest_tail, tails_of
+from factors.tails import likeliest_tail, tail_evidence, tails_of
 from ssm_graph.base import chi2
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.reweighting import Lengths
 
+MOST_HIDDEN: Final = 1.2
+"""Times the stated noise over what the median says, beyond which no gross ones are told from it."""
+DECISIVE: Final = 10.0
+"""Logarithm of odds; a weight that ends is taken for nothing less."""
 _QUANTILES: Final = (np.arange(4000) + 0.5) / 4000.0
 
 
@@ -57,9 +62,11 @@ def weights_of(kernel: Kernel, t: Array, dim: Array) -> Array:
 
 
 def tail_of(kernel: Kernel, lengths: Lengths, weights: Array, dim: Array) -> Kernel:
-    """Return the kernel with the tail that makes measurements likeliest, see `factors.tails`.
+    """Return the kernel that makes measurements likeliest, if one may choose for this one.
 
-    Those that err less than stated hide their tail: they count as if their median were as stated.
+    For the logarithm's: one of the same family with a lighter tail (`factors.tails`), or, where
+    some are gross and all else is normal, the mixture of both (`factors.mixture`). Those that err
+    less than stated hide their tail: they count as if their median were as stated.
 
     Parameters
     ----------
@@ -68,14 +75,21 @@ def tail_of(kernel: Kernel, lengths: Lengths, weights: Array, dim: Array) -> Ker
     weights : (M,)
     dim : (M,) of their rows; of those without any nothing is asked.
     """
-    tails = tails_of(kernel)
+    tails, mixture = tails_of(kernel), None
+    if len(tails) == 1:
+        return kernel
     evidence, largest = np.zeros(len(tails)), int(np.max(dim, initial=1))
     for size in range(1, largest + 1):
         own = dim == size
         if not own.any():
             continue
         square = lengths.square[own]
-        square *= max(chi2.ppf(0.5, size) / float(np.median(square)), 1.0)
-        part = Lengths(square, lengths.spread[own])
-        evidence += part.evidence(tails, weights[own], dim=size)
+        hidden = max(chi2.ppf(0.5, size) / float(np.median(square)), 1.0)
+        part = Lengths(hidden * square, lengths.spread[own])
+        telling = part.telling(weights[own], dim=size)
+        evidence += tail_evidence(tails, part.square, telling, dim=size)
+        if own.all() and hidden < MOST_HIDDEN:
+            mixture = likeliest_mixture(square, telling, dim=size)
+    if mixture is not None and mixture.evidence > np.max(evidence) + DECISIVE:
+        return mixture.kernel
     return likeliest_tail(tails, evidence, dim=largest)
