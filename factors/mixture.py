@@ -20,7 +20,6 @@ from dataclasses import dataclass
 from typing import ClassVar, Final, NamedTuple, final
 
 import numpy as np
-from scipy.special import expit
 
 from factors.similarity import Array, Kernel
 
@@ -29,6 +28,11 @@ MOST_GROSS: Final = 0.4
 """Share beyond which sigmas are wrong rather than measurements."""
 SUPPOSED_SQ: Final = 36.0
 """``t`` of a gross measurement supposed beforehand: six sigmas, as in :mod:`factors.tails`."""
+
+
+def _logistic(x: Array) -> Array:
+    """Return ``1 / (1 + exp(-x))``, which never overflows."""
+    return np.asarray(0.5 + 0.5 * np.tanh(0.5 * x))
 
 
 @final
@@ -45,7 +49,7 @@ class MixtureKernel(Kernel):
         return np.logaddexp(-0.5 * t, -0.5 * self.even)
 
     def _weight(self, t: Array, dim: int | Array) -> Array:  # noqa: ARG002
-        return np.asarray(expit(0.5 * (self.even - t)))
+        return _logistic(0.5 * (self.even - t))
 
 
 class LikeliestMixture(NamedTuple):
@@ -72,7 +76,7 @@ def likeliest_mixture(t: Array, telling: Array, *, dim: int) -> LikeliestMixture
     share = 0.1
     for _ in range(ROUNDS):
         even = -2.0 * (math.log(share / (1.0 - share)) + log_ratio)
-        gross = expit(0.5 * (t - even))
+        gross = _logistic(0.5 * (t - even))
         share = float(np.average(gross, weights=telling))
         if share > MOST_GROSS:
             return None
