@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from factors.mixture import MixtureKernel, likeliest_mixture
 from factors.similarity import Array, LogKernel
 from factors.tails import tail_evidence, tails_of
 
 
-def contaminated(share: float, *, dim: int, n: int = 4000) -> tuple[Array, Array]:
+def contaminated(share: float, *, dim: int, n: int = 4000) -> tuple[Array, NDArray[np.bool_]]:
     """Return squared lengths (n,), this share of them from anywhere, and which those are."""
     rng = np.random.default_rng(5)
     gross = rng.random(n) < share
