@@ -291,8 +291,7 @@ def smooth_landmarks(
     end = _settled(problem, noise, how, kernel, values, w)
     if not np.all(np.isfinite(end.last.values.pose)):
         raise SolverError("smooth_landmarks: no finite solution; look at sigmas and first values")
-    status = SlamStatus.CONVERGED if end.is_settled else SlamStatus.MAX_ITERATIONS
-    return estimate_of(problem, noise, end.last, status, end.n_passes)
+    return _estimate_of(problem, noise, how, end)
 
 
 class _Settled(NamedTuple):
@@ -349,18 +348,22 @@ def with_drift(problem: SlamProblem, values: Values) -> Values:
     )
 
 
-def estimate_of(
-    problem: SlamProblem, noise: SlamNoise, found: Pass, status: SlamStatus, count: int
+def _estimate_of(
+    problem: SlamProblem, noise: SlamNoise, how: SmootherSettings, end: _Settled
 ) -> SlamEstimate:
-    """Return a pass as an answer."""
+    """Return where the passes ended as an answer."""
+    found = end.last
     L = len(found.values.landmarks)
     P = found.solution.constants_cov[: 2 * L, : 2 * L].reshape(L, 2, L, 2)
-    at = np.arange(L)
+    at, notes = np.arange(L), []
     seen = np.bincount(problem.landmark, minlength=L)
     once = [problem.names[i] for i in np.flatnonzero(seen == 1)]
-    note = (
-        (f"seen only once, placed by that alone: landmarks {', '.join(once[:5])}",) if once else ()
-    )
+    if once:
+        notes.append(f"seen only once, placed by that alone: landmarks {', '.join(once[:5])}")
+    if end.kernel != how.kernel:
+        notes.append(
+            f"observations weighed by {end.kernel}: it makes them likelier than {how.kernel}"
+        )
     return SlamEstimate(
         found.values.pose,
         found.expected.pose_cov,
@@ -368,8 +371,8 @@ def estimate_of(
         P[at, :, at],
         found.weights,
         noise,
-        status,
-        count,
+        SlamStatus.CONVERGED if end.is_settled else SlamStatus.MAX_ITERATIONS,
+        end.n_passes,
         found.values.drift,
-        note,
+        tuple(notes),
     )
