@@ -26,6 +26,8 @@ from factors.similarity import Array, Kernel
 ROUNDS: Final = 30
 MOST_GROSS: Final = 0.4
 """Share beyond which sigmas are wrong rather than measurements."""
+LEAST_GROSS: Final = 1e-12
+"""Share that is next to none: its logarithm is still a number."""
 SUPPOSED_SQ: Final = 36.0
 """``t`` of a gross measurement supposed beforehand: six sigmas, as in :mod:`factors.tails`."""
 
@@ -41,7 +43,7 @@ class MixtureKernel(Kernel):
     """``f = ln(exp(-t/2) + exp(-even/2))``: normal, or anywhere."""
 
     name: ClassVar[str] = "mixture"
-    even: float = 14.0
+    even: float
     """``t`` at which a measurement is as likely gross as sound."""
 
     def similarity(self, t: Array, *, dim: int = 1) -> Array:  # noqa: ARG002
@@ -77,7 +79,7 @@ def likeliest_mixture(t: Array, telling: Array, *, dim: int) -> LikeliestMixture
     for _ in range(ROUNDS):
         even = -2.0 * (math.log(share / (1.0 - share)) + log_ratio)
         gross = _logistic(0.5 * (t - even))
-        share = float(np.average(gross, weights=telling))
+        share = max(float(np.average(gross, weights=telling)), LEAST_GROSS)
         if share > MOST_GROSS:
             return None
     logs = np.logaddexp(-0.5 * t, -0.5 * even)

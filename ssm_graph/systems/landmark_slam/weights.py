@@ -65,8 +65,9 @@ def tail_of(kernel: Kernel, lengths: Lengths, weights: Array, dim: Array) -> Ker
     """Return the kernel that makes measurements likeliest, if one may choose for this one.
 
     For the logarithm's: one of the same family with a lighter tail (`factors.tails`), or, where
-    some are gross and all else is normal, the mixture of both (`factors.mixture`). Those that err
-    less than stated hide their tail: they count as if their median were as stated.
+    some are gross and all else is normal, the mixture of both (`factors.mixture`; of measurements
+    with one number of rows). Those that err less than stated hide their tail: they count as if
+    their median were as stated.
 
     Parameters
     ----------
