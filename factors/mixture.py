@@ -22,14 +22,13 @@ from typing import ClassVar, Final, NamedTuple, final
 import numpy as np
 
 from factors.similarity import Array, Kernel
+from factors.tails import DOUBTED_SQ
 
 ROUNDS: Final = 30
 MOST_GROSS: Final = 0.4
 """Share beyond which sigmas are wrong rather than measurements."""
 LEAST_GROSS: Final = 1e-12
 """Share that is next to none: its logarithm is still a number."""
-SUPPOSED_SQ: Final = 36.0
-"""``t`` of a gross measurement supposed beforehand: six sigmas, as in :mod:`factors.tails`."""
 
 
 def _logistic(x: Array) -> Array:
@@ -65,14 +64,15 @@ class LikeliestMixture(NamedTuple):
 def likeliest_mixture(t: Array, telling: Array, *, dim: int) -> LikeliestMixture | None:
     """Return the mixture of greatest likelihood; None if more than sound ones would be gross.
 
-    By expectation maximisation of the share; gross ones lie within the farthest.
+    By expectation maximisation of the share; gross ones lie within the farthest, and one is
+    supposed beforehand, as for tails.
 
     Parameters
     ----------
     t, telling : as of :func:`factors.tails.tail_evidence`.
     dim : of the measurements.
     """
-    t, telling = np.append(t, SUPPOSED_SQ), np.append(telling, 1.0)
+    t, telling = np.append(t, DOUBTED_SQ), np.append(telling, 1.0)
     ball = math.pi ** (0.5 * dim) / math.gamma(0.5 * dim + 1.0)
     log_ratio = 0.5 * dim * math.log(2.0 * math.pi / float(np.max(t))) - math.log(ball)
     share = 0.1

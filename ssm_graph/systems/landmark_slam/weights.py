@@ -16,7 +16,7 @@ from scipy.optimize import brentq
 
 from factors.mixture import likeliest_mixture
 from factors.similarity import GaussianKernel, Kernel
-from factors.tails import likeliest_tail, tail_evidence, tails_of
+from factors.tails import likeliest_tail, tails_of
 from ssm_graph.base import chi2
 from ssm_graph.base.frozen import Array
 from ssm_graph.engine.reweighting import Lengths
@@ -87,10 +87,9 @@ def tail_of(kernel: Kernel, lengths: Lengths, weights: Array, dim: Array) -> Ker
         square = lengths.square[own]
         hidden = max(chi2.ppf(0.5, size) / float(np.median(square)), 1.0)
         part = Lengths(hidden * square, lengths.spread[own])
-        telling = part.telling(weights[own], dim=size)
-        evidence += tail_evidence(tails, part.square, telling, dim=size)
+        evidence += part.evidence(tails, weights[own], dim=size)
         if own.all() and hidden < MOST_HIDDEN:
-            mixture = likeliest_mixture(square, telling, dim=size)
+            mixture = likeliest_mixture(square, part.telling(weights, dim=size), dim=size)
     if mixture is not None and mixture.evidence > np.max(evidence) + DECISIVE:
         return mixture.kernel
     return likeliest_tail(tails, evidence, dim=largest)
